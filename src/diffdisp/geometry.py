@@ -1,0 +1,73 @@
+"""Shapes: where a ray meets them."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from diffdisp.dispersion import real_array
+from diffdisp.vector import Real, Triple, Vec3, choose, least_square, normalize, safe_sqrt
+
+
+class Ray(NamedTuple):
+    """Half-line from `origin` (scene units) along the unit vector `direction`."""
+
+    origin: Vec3
+    direction: Vec3
+
+
+class Sphere(eqx.Module):
+    """Ball or hollow lamp: `center` and `radius` in scene units, radius > 0."""
+
+    center: Triple = eqx.field(converter=real_array)
+    radius: Real = eqx.field(converter=real_array)
+
+
+class Plane(eqx.Module):
+    """Infinite plane through `point` (scene units), at right angles to `normal` (any length)."""
+
+    point: Triple = eqx.field(converter=real_array)
+    normal: Triple = eqx.field(converter=real_array)
+
+
+def sphere_distances(ray: Ray, center: Vec3, radius: Real) -> tuple[Real, Real, jax.Array]:
+    """Distances t₁ ≤ t₂ along the ray to its line's two points on a sphere, and whether it has any.
+
+    Source:
+        Haines, Günther, Akenine-Möller, "Precision Improvements for Ray/Sphere Intersection",
+        Ray Tracing Gems (2019), ch. 7: the discriminant from the foot of the perpendicular, which
+        far small spheres keep in float32, and the second root from the product of both.
+    """
+    to_origin = ray.origin - center
+    b = -to_origin.dot(ray.direction)
+    foot = to_origin + ray.direction * b
+    discriminant = radius * radius - foot.dot(foot)
+    least = least_square() * radius * radius
+    root = safe_sqrt(discriminant, least)
+    q = b + jnp.where(b < 0, -root, root)
+    product = to_origin.dot(to_origin) - radius * radius
+    other = product / jnp.where(q == 0, 1.0, q)
+    return jnp.minimum(q, other), jnp.maximum(q, other), discriminant > least
+
+
+def plane_distance(ray: Ray, point: Vec3, normal: Vec3) -> Real:
+    """Distance along the ray to a plane; -1 where they are parallel."""
+    cosine = ray.direction.dot(normal)
+    parallel = cosine == 0
+    distance = (point - ray.origin).dot(normal) / jnp.where(parallel, 1.0, cosine)
+    return jnp.where(parallel, -1.0, distance)
+
+
+def plane_axes(normal: Vec3) -> tuple[Vec3, Vec3]:
+    """The plane's own unit axes u and v.
+
+    u = (0, 1, 0) × normal, normalised, or (1, 0, 0) where the normal is along y; v = normal × u.
+    """
+    length = jnp.sqrt(normal.dot(normal))
+    unit = normal * (1.0 / length)
+    zero = jnp.zeros_like(unit.x)
+    upright = (unit.x == 0) & (unit.z == 0)
+    across = Vec3(jnp.where(upright, 1.0, unit.z), zero, jnp.where(upright, 0.0, -unit.x))
+    u = choose(upright, Vec3(zero + 1.0, zero, zero), normalize(across))
+    return u, unit.cross(u)

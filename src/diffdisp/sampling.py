@@ -1,0 +1,64 @@
+"""The numbers of (pixel, sample, dimension)."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from diffdisp.vector import Real
+
+
+def sample_grid(samples: int) -> tuple[int, int]:
+    """Columns and rows (a, b) of the grid of `samples` points in a pixel: a·b = samples, a ≥ b.
+
+    A grid, because the footprints of its points tile the pixel without gap or overlap.
+    """
+    rows = next(b for b in range(int(samples**0.5), 0, -1) if samples % b == 0)
+    return samples // rows, rows
+
+
+def mixed(word: jax.Array) -> jax.Array:
+    """A 32-bit word with its bits thoroughly mixed.
+
+    Source:
+        Ettinger, "lowbias32", in Wellons, Prospecting for Hash Functions (2018).
+    """
+    word = word ^ (word >> 16)
+    word = word * np.uint32(0x7FEB352D)
+    word = word ^ (word >> 15)
+    word = word * np.uint32(0x846CA68B)
+    return word ^ (word >> 16)
+
+
+def sequence_steps(dimensions: int) -> np.ndarray:
+    """Steps (dimensions,) of Richtmyer's sequence: the fractions of √prime, in units of 2⁻³².
+
+    Source:
+        Niederreiter, Random Number Generation and Quasi-Monte Carlo Methods (1992), section 3.1:
+        multiples of square roots of primes, which are linearly independent over the rationals.
+    """
+    primes: list[int] = []
+    candidate = 2
+    while len(primes) < dimensions:
+        if all(candidate % p for p in primes if p * p <= candidate):
+            primes.append(candidate)
+        candidate += 1
+    fractions = np.sqrt(np.array(primes, np.float64)) % 1.0
+    return (fractions * 2.0**32).astype(np.uint32)
+
+
+def low_discrepancy(
+    pixel: jax.Array, sample: jax.Array, dimension: jax.Array, step: jax.Array, seed: jax.Array
+) -> Real:
+    """A number in [0, 1) of a sequence that every pixel and dimension starts elsewhere.
+
+    Args:
+        pixel: number of the pixel in the picture, uint32.
+        sample: number of the sample in the pixel, uint32.
+        dimension: which decision of the path it serves, uint32.
+        step: the dimension's entry of `sequence_steps`, uint32.
+        seed: of the picture, uint32.
+    """
+    start = mixed(pixel ^ mixed(dimension ^ mixed(seed)))
+    word = start + sample * step
+    # 24 bits fit the significand of float32, so that the number stays below 1.
+    return (word >> 8).astype(jnp.result_type(float)) * 2.0**-24

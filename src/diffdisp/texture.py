@@ -1,0 +1,88 @@
+"""What a surface shows at a point, averaged over the footprint of a sample."""
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from diffdisp.dispersion import real_array
+from diffdisp.vector import Real, Triple
+
+
+class Solid(eqx.Module):
+    """One colour everywhere; `color` is linear sRGB, each channel ≥ 0."""
+
+    color: Triple = eqx.field(converter=real_array)
+
+
+class Checker2D(eqx.Module):
+    """Square tiles on a plane, in the plane's own axes; a corner of four lies on its `point`.
+
+    Args:
+        even: linear sRGB of the tile with both coordinates positive, and of every second one.
+        odd: linear sRGB of the others.
+        tile: width of a tile, scene units, > 0.
+    """
+
+    even: Triple = eqx.field(converter=real_array)
+    odd: Triple = eqx.field(converter=real_array)
+    tile: Real = eqx.field(converter=real_array)
+
+
+Texture = Solid | Checker2D
+
+
+def as_texture(value: object) -> object:
+    """A texture as it is; three numbers as the `Solid` they abbreviate."""
+    if isinstance(value, Solid | Checker2D):
+        return value
+    return Solid(value)
+
+
+def filtered_square_wave(x: Real, across: Real, down: Real) -> Real:
+    """Mean of a square wave under two boxes convolved: the marginal of a parallelogram.
+
+    The wave is +1 on (0, 1), -1 on (1, 2) and has period 2.
+
+    Args:
+        x: the middle of the footprint, in tiles.
+        across: how far the footprint's one edge reaches, in tiles; any sign.
+        down: the same for its other edge.
+
+    Returns:
+        The mean, within [-1, 1]; its derivatives are finite everywhere and continuous but where
+        a footprint begins to touch a second edge.
+    """
+    wide = jnp.maximum(jnp.abs(across), jnp.abs(down))
+    # A box far narrower than the other smooths nothing, but dividing by it would cancel digits.
+    narrow = jnp.maximum(jnp.minimum(jnp.abs(across), jnp.abs(down)), 1e-3 * wide)
+    reach, flat = 0.5 * (wide + narrow), 0.5 * (wide - narrow)
+    return jnp.where(reach <= 0.5, _near_edge(x, wide, narrow, reach, flat),
+                     _many_edges(x, wide, narrow, reach, flat))
+
+
+def _near_edge(x: Real, wide: Real, narrow: Real, reach: Real, flat: Real) -> Real:
+    """The filtered wave where the footprint meets one edge at most; exact in float32 too."""
+    edge = jnp.round(x)
+    rising = 1.0 - 2.0 * jnp.abs(edge - 2.0 * jnp.round(0.5 * edge))
+    signed = x - edge
+    distance = jnp.abs(signed)
+    side = jnp.where(signed < 0, -rising, rising)
+    sharp = wide <= 0
+    inner = 2.0 * distance / jnp.where(sharp, 1.0, wide)
+    short = jnp.maximum(reach - distance, 0.0)
+    outer = 1.0 - short * short / jnp.where(sharp, 1.0, wide * narrow)
+    return side * jnp.where(sharp | (distance >= reach), 1.0,
+                            jnp.where(distance <= flat, inner, outer))
+
+
+def _many_edges(x: Real, wide: Real, narrow: Real, reach: Real, flat: Real) -> Real:
+    """The filtered wave as second differences of the twice integrated one."""
+    area = jnp.where(reach > 0, wide * narrow, 1.0)
+    sums = _integrated(x + reach) - _integrated(x + flat)
+    return (sums - _integrated(x - flat) + _integrated(x - reach)) / area
+
+
+def _integrated(x: Real) -> Real:
+    """A periodic second integral of the square wave: a chain of parabolas."""
+    inside = x - 2.0 * jnp.floor(0.5 * x)
+    half = jnp.where(inside < 1.0, inside, inside - 1.0)
+    return 0.5 * half * (half - 1.0) * jnp.where(inside < 1.0, 1.0, -1.0)

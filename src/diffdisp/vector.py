@@ -1,0 +1,86 @@
+"""Vectors as three scalars, and roots whose gradients stay finite."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+Real = Float[jax.Array | np.ndarray, ""]
+"""One real number; `vmap` makes many of it."""
+
+Triple = Float[jax.Array | np.ndarray, "3"]
+"""Three numbers as data holds them: a point, a direction or a colour."""
+
+
+class Vec3(NamedTuple):
+    """A vector of three scalars.
+
+    Under `vmap` this is three long arrays; an array of three would become an (N, 3) array
+    whose inner loop has length 3, which runs many times slower.
+    """
+
+    x: Real
+    y: Real
+    z: Real
+
+    def __add__(self, other: "Vec3") -> "Vec3":  # type: ignore[override]
+        """Sum of two vectors (not the concatenation of two tuples)."""
+        return Vec3(self.x + other.x, self.y + other.y, self.z + other.z)
+
+    def __sub__(self, other: "Vec3") -> "Vec3":
+        """Difference of two vectors."""
+        return Vec3(self.x - other.x, self.y - other.y, self.z - other.z)
+
+    def __neg__(self) -> "Vec3":
+        """The opposite vector."""
+        return Vec3(-self.x, -self.y, -self.z)
+
+    def __mul__(self, scale: Real) -> "Vec3":  # type: ignore[override]
+        """The vector times a scalar."""
+        return Vec3(self.x * scale, self.y * scale, self.z * scale)
+
+    def dot(self, other: "Vec3") -> Real:
+        """Scalar product."""
+        return self.x * other.x + self.y * other.y + self.z * other.z
+
+    def cross(self, other: "Vec3") -> "Vec3":
+        """Vector product."""
+        return Vec3(
+            self.y * other.z - self.z * other.y,
+            self.z * other.x - self.x * other.z,
+            self.x * other.y - self.y * other.x,
+        )
+
+
+def vec3(triple: Triple) -> Vec3:
+    """The vector held in an array of three."""
+    return Vec3(triple[0], triple[1], triple[2])
+
+
+def choose(condition: jax.Array | bool, a: Any, b: Any) -> Any:
+    """`a` where the condition holds, else `b`, leaf by leaf; known conditions cost nothing."""
+    if isinstance(condition, bool):
+        return a if condition else b
+    return jax.tree.map(lambda p, q: jnp.where(condition, p, q), a, b)
+
+
+def least_square() -> float:
+    """Squared cosines below this count as zero: 1e-10 in float32, 1e-20 in float64.
+
+    A root has an infinite slope at zero, and second derivatives grow as its cube; this far from
+    zero they stay within the range of the type, and what is cut off is seen by no pixel.
+    """
+    return 1e-20 if jnp.result_type(float) == jnp.float64 else 1e-10
+
+
+def safe_sqrt(x: Real, above: Real | float = 0.0) -> Real:
+    """`sqrt(x)` where `x > above`, which is ≥ 0; elsewhere 0, with zero gradient."""
+    positive = x > above
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
+
+
+def normalize(v: Vec3) -> Vec3:
+    """The unit vector along `v`; NaN for the zero vector, which has none."""
+    return v * (1.0 / jnp.sqrt(v.dot(v)))
