@@ -301,6 +301,7 @@ def bounce(
     emission: Emission,
     plan: Plan,
     inside: jax.Array | bool,
+    cutoff: Real,
     one: jax.Array | None,
 ) -> Path:
     """The path advanced by one glass surface.
@@ -368,7 +369,7 @@ def bounce(
     throughput = path.throughput * share
     bounces = path.bounces + jnp.where(differ, 1, 0)
     # A path of b bounces has b + 1 segments, and the light that it adds next came over one more.
-    alive = path.alive & goes_on & (throughput > plan.cutoff) & (bounces < plan.depth - 1)
+    alive = path.alive & goes_on & (throughput > cutoff) & (bounces < plan.depth - 1)
     moved = Path(
         ray, footprint, ball, path.ball, throughput, path.radiance, bounces, path.alive
     )
@@ -425,7 +426,8 @@ class Lanes(NamedTuple):
 
     Lanes are (wavelengths J, samples S, pixels P). What does not depend on the wavelength has
     no such axis, and is traced once for all of them. `weights` are those of the samples that meet
-    glass; the others count alike.
+    glass; the others count alike. A path ends when less than `cutoff` of its light is left.
+    `one` is as in `once`.
     """
 
     world: World
@@ -440,6 +442,7 @@ class Lanes(NamedTuple):
     pixel: jax.Array
     sample: jax.Array
     seed: jax.Array
+    cutoff: Real
     one: jax.Array | None
 
 
@@ -543,7 +546,7 @@ def _through_glass(
             return low_discrepancy(pixel, sample, word, steps[bounces], lanes.seed)
 
         side = path.last == path.ball if inside is None else inside
-        return bounce(path, branch, index, world, emission, plan, side, lanes.one)
+        return bounce(path, branch, index, world, emission, plan, side, lanes.cutoff, lanes.one)
 
     def every_path(inside: bool | None) -> Callable[[Path], Path]:
         pixels = jax.vmap(partial(advance, inside=inside), (0, 0, None, None, None))

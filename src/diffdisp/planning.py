@@ -23,7 +23,6 @@ class Plan:
         samples: film samples per pixel.
         depth: segments a path may have.
         dtype: float32 or float64.
-        cutoff: a path ends when less than this part of its light is left.
         colour: linear sRGB instead of bands.
         balls: number of glass balls.
         lamps: number of spheres that emit.
@@ -36,7 +35,6 @@ class Plan:
     samples: int
     depth: int
     dtype: str
-    cutoff: float
     colour: bool
     balls: int
     lamps: int
@@ -78,19 +76,8 @@ class Plan:
         )
 
 
-def make_plan(
-    scene: Scene, film: Film, samples: int, depth: int, dtype: str, cutoff: float | None = None
-) -> Plan:
-    """What `scene` on `film` requires.
-
-    Args:
-        scene: the scene; of numbers that JAX traces, the general case is assumed.
-        film: bands or colour.
-        samples: film samples per pixel.
-        depth: segments a path may have.
-        dtype: "float32" or "float64".
-        cutoff: a path ends when less than this part of its light is left; by default far beneath
-            the last digit of the sum.
+def make_plan(scene: Scene, film: Film, samples: int, depth: int, dtype: str) -> Plan:
+    """What `scene` on `film` requires; of numbers that JAX traces, the general case.
 
     Raises:
         ValueError: samples or depth below 1.
@@ -103,7 +90,6 @@ def make_plan(
         samples=samples,
         depth=depth,
         dtype=dtype,
-        cutoff=0.1 * float(np.finfo(dtype).eps) if cutoff is None else cutoff,
         colour=film.wavelengths is None,
         balls=len(balls),
         lamps=len(scene.objects) - len(balls) - len(planes),

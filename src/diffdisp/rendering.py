@@ -1,5 +1,6 @@
 """From a scene to a picture: chunks of pixels, threads, progress."""
 
+import itertools
 import os
 import threading
 import warnings
@@ -41,6 +42,20 @@ class Pixels(NamedTuple):
     y: Float[jax.Array | np.ndarray, "*chunks pixels"]
     number: jax.Array | np.ndarray
     size: Float[jax.Array | np.ndarray, ""]
+
+
+class RunNumbers(NamedTuple):
+    """What else a run needs: its seed, when a path ends, and a 1 that no compiler knows."""
+
+    seed: np.ndarray
+    cutoff: np.ndarray
+    one: np.ndarray
+
+
+def run_numbers(plan: Plan, seed: int, cutoff: float | None = None) -> RunNumbers:
+    """Numbers of a run; without `cutoff` a path ends beneath the last digit of its light."""
+    least = 0.1 * float(np.finfo(plan.dtype).eps) if cutoff is None else cutoff
+    return RunNumbers(np.uint32(seed % 2**32), np.asarray(least), np.int32(1))
 
 
 def render(
@@ -92,7 +107,7 @@ def _picture(
     plan = make_plan(scene, film, samples, depth, dtype or jnp.result_type(float).name)
     chunks, place = all_pixels(film, chunk_pixels(film, plan))
     values = _render_chunks(
-        plan, scene, film_spectrum(film, plan), film_size(film), chunks, *_run_numbers(seed)
+        plan, scene, film_spectrum(film, plan), film_size(film), chunks, run_numbers(plan, seed)
     )
     return values.reshape(-1, film.channels)[place].reshape(film.height, film.width, film.channels)
 
@@ -100,10 +115,6 @@ def _picture(
 def film_size(film: Film) -> tuple[np.ndarray, np.ndarray]:
     """Width and height as numbers, so that another size is no other program."""
     return np.asarray(float(film.width)), np.asarray(float(film.height))
-
-
-def _run_numbers(seed: int) -> tuple[jax.Array, jax.Array]:
-    return jnp.asarray(seed % 2**32, jnp.uint32), jnp.asarray(1, jnp.int32)
 
 
 def film_range(film: Film) -> tuple[float, float]:
@@ -158,13 +169,26 @@ def all_pixels(film: Film, count: int) -> tuple[Pixels, np.ndarray]:
         The pixels, and for each pixel of the picture, row by row, its place among them. The last
         chunk repeats its last pixel to be as long as the others.
     """
-    return blocks(film.width, film.height, 1, count)
+    return some_blocks(np.arange(film.width * film.height), film.width, 1, count)
 
 
-def blocks(width: int, height: int, size: int, count: int) -> tuple[Pixels, np.ndarray]:
-    """Square blocks of `size` pixels, as `all_pixels`; `width` and `height` count blocks."""
+def some_blocks(
+    numbers: np.ndarray, width: int, size: int, count: int
+) -> tuple[Pixels, np.ndarray]:
+    """Square blocks of `size` pixels by their numbers, row by row of `width` blocks.
+
+    Args:
+        numbers: (blocks,) which blocks.
+        width: blocks in a row of the picture.
+        size: edge of a block, pixels.
+        count: blocks of a chunk.
+
+    Returns:
+        The blocks in chunks, those that lie close together in one, and the place (blocks,) of
+        each of `numbers` among them. The last chunk repeats its last block to be full.
+    """
     tile = max(1, int(count**0.5))
-    y, x = np.divmod(np.arange(width * height), width)
+    y, x = np.divmod(numbers, width)
     # Tiles of a chunk's size: paths that are alike end together.
     order = np.lexsort((x % tile, y % tile, x // tile, y // tile))
     place = np.empty_like(order)
@@ -173,7 +197,10 @@ def blocks(width: int, height: int, size: int, count: int) -> tuple[Pixels, np.n
     order = np.append(order, np.repeat(order[-1], chunks * count - len(order)))
     order = order.reshape(chunks, count)
     return Pixels(
-        x[order] * float(size), y[order] * float(size), order.astype(np.uint32), np.float64(size)
+        x[order] * float(size),
+        y[order] * float(size),
+        numbers[order].astype(np.uint32),
+        np.asarray(float(size)),
     ), place
 
 
@@ -191,7 +218,7 @@ def render_pixels(
 
     def run(part: Pixels) -> np.ndarray:
         return np.asarray(
-            _render_chunks_jit(plan, scene, spectrum, size, part, *_run_numbers(seed))
+            _render_chunks_jit(plan, scene, spectrum, size, part, run_numbers(plan, seed))
         )
 
     return over_chunks(run, chunks, plan.dtype, progress)
@@ -208,8 +235,7 @@ def over_chunks(
     XLA's CPU backend keeps to one core what a program does to a few thousand numbers at a time,
     but threads may run it side by side. Parts are of equal length so that one program serves all.
     """
-    total = len(chunks.x)
-    length = min(CHUNKS_PER_CALL, total)
+    total, length = len(chunks.x), CHUNKS_PER_CALL
     starts = list(range(0, total, length))
     stop = threading.Event()
 
@@ -225,7 +251,9 @@ def over_chunks(
     results = []
     with ThreadPoolExecutor(min(workers, len(starts))) as pool:
         try:
-            for result in pool.map(part, starts):
+            # The first alone: two threads at once would compile the same program twice.
+            first = [pool.submit(part, starts[0]).result()]
+            for result in itertools.chain(first, pool.map(part, starts[1:])):
                 results.append(result)
                 if progress:
                     progress(min(len(results) * length, total), total)
@@ -282,8 +310,7 @@ def chunk_lanes(
     spectrum: Spectrum,
     size: tuple[jax.Array, jax.Array],
     pixels: Pixels,
-    seed: jax.Array,
-    one: jax.Array,
+    run: RunNumbers,
 ) -> Lanes:
     """The film samples of one chunk of pixels.
 
@@ -293,8 +320,7 @@ def chunk_lanes(
         spectrum: the film's spectrum under the plan.
         size: width and height of the film, pixels.
         pixels: one chunk, without the axis of chunks.
-        seed: of the sequence that chooses branches.
-        one: the number 1, unknown to the compiler.
+        run: the other numbers.
     """
     columns, rows = sample_grid(plan.samples)
     sample = np.arange(plan.samples)
@@ -321,8 +347,9 @@ def chunk_lanes(
         pixels.y[None, :] + down,
         pixels.number,
         jnp.asarray(sample, jnp.uint32),
-        seed,
-        one,
+        run.seed,
+        run.cutoff,
+        run.one,
     )
 
 
@@ -343,26 +370,36 @@ def _render_chunks(
     spectrum: Spectrum,
     size: tuple[jax.Array, jax.Array],
     chunks: Pixels,
-    seed: jax.Array,
-    one: jax.Array,
+    run: RunNumbers,
 ) -> Float[jax.Array, "chunks pixels channels"]:
     """Mean radiance of each pixel, one chunk after another."""
-    scene, spectrum, size, corner = in_dtype(
-        (scene, spectrum, size, (chunks.x, chunks.y, chunks.size)), plan.dtype
+    scene, spectrum, size, chunks, run = in_dtype(
+        (scene, spectrum, size, chunks, run), plan.dtype
     )
     indices = glass_indices(scene, spectrum.wavelengths)
 
-    def chunk(row: tuple) -> jax.Array:
-        pixels = Pixels(row[0], row[1], row[2], corner[2])
-        lanes = chunk_lanes(plan, scene, spectrum, size, pixels, seed, one)
+    def chunk(pixels: Pixels) -> jax.Array:
+        lanes = chunk_lanes(plan, scene, spectrum, size, pixels, run)
         return combine(lane_radiance(plan, indices, lanes), spectrum)
 
-    return jax.lax.map(chunk, (corner[0], corner[1], chunks.number))
+    return each_chunk(chunk, chunks)
+
+
+def each_chunk(chunk: Callable[[Pixels], jax.Array], chunks: Pixels) -> jax.Array:
+    """`chunk` of one chunk after another."""
+    return jax.lax.map(
+        lambda row: chunk(Pixels(*row, chunks.size)), (chunks.x, chunks.y, chunks.number)
+    )
 
 
 def in_dtype(tree: Any, dtype: str) -> Any:
-    """The tree with its real numbers in `dtype`."""
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), tree)
+    """The tree with its real numbers in `dtype`; whole numbers stay as they are."""
+
+    def cast(leaf: jax.Array | np.ndarray) -> jax.Array:
+        real = jnp.issubdtype(leaf.dtype, jnp.floating)
+        return jnp.asarray(leaf, dtype) if real else jnp.asarray(leaf)
+
+    return jax.tree.map(cast, tree)
 
 
 WIDE_VECTORS = {"xla_cpu_prefer_vector_width": "512"}

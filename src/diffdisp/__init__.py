@@ -1,0 +1,96 @@
+"""Differentiable dispersion renderer: draws dispersive glass, and recovers it from pictures.
+
+Names are looked up when they are first used, so that `import diffdisp` takes no time: JAX alone
+takes 0.8 s.
+"""
+
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from diffdisp.camera import Camera
+    from diffdisp.color import encode_srgb
+    from diffdisp.dispersion import Sellmeier
+    from diffdisp.film import Film, band_middles
+    from diffdisp.fitting import FitResult, fit
+    from diffdisp.geometry import Plane, Sphere
+    from diffdisp.glasses import glass_source, glass_table, load_glass, named_glass
+    from diffdisp.image import Picture, linear_rgb, read_picture, write_picture
+    from diffdisp.material import Dielectric, Emitter
+    from diffdisp.planning import Plan, make_plan
+    from diffdisp.rendering import render
+    from diffdisp.report import result_table, write_fit_json, write_report
+    from diffdisp.scene import Background, Object, Scene, with_glass
+    from diffdisp.scene_file import SceneError, load_scene, save_scene, scene_schema
+    from diffdisp.texture import Checker2D, Solid
+
+__all__ = [
+    "Background",
+    "Camera",
+    "Checker2D",
+    "Dielectric",
+    "Emitter",
+    "Film",
+    "FitResult",
+    "Object",
+    "Picture",
+    "Plan",
+    "Plane",
+    "Scene",
+    "SceneError",
+    "Sellmeier",
+    "Solid",
+    "Sphere",
+    "band_middles",
+    "encode_srgb",
+    "fit",
+    "glass_source",
+    "glass_table",
+    "linear_rgb",
+    "load_glass",
+    "load_scene",
+    "make_plan",
+    "named_glass",
+    "read_picture",
+    "render",
+    "result_table",
+    "save_scene",
+    "scene_schema",
+    "with_glass",
+    "write_fit_json",
+    "write_picture",
+    "write_report",
+]
+
+_NAMES = {
+    "camera": ("Camera",),
+    "color": ("encode_srgb",),
+    "dispersion": ("Sellmeier",),
+    "film": ("Film", "band_middles"),
+    "fitting": ("FitResult", "fit"),
+    "geometry": ("Plane", "Sphere"),
+    "glasses": ("glass_source", "glass_table", "load_glass", "named_glass"),
+    "image": ("Picture", "linear_rgb", "read_picture", "write_picture"),
+    "material": ("Dielectric", "Emitter"),
+    "planning": ("Plan", "make_plan"),
+    "rendering": ("render",),
+    "report": ("result_table", "write_fit_json", "write_report"),
+    "scene": ("Background", "Object", "Scene", "with_glass"),
+    "scene_file": ("SceneError", "load_scene", "save_scene", "scene_schema"),
+    "texture": ("Checker2D", "Solid"),
+}
+_MODULE = {name: module for module, names in _NAMES.items() for name in names}
+
+
+def __getattr__(name: str) -> object:
+    """The public name, from the module that defines it."""
+    if name not in _MODULE:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value: object = getattr(importlib.import_module(f"{__name__}.{_MODULE[name]}"), name)
+    globals()[name] = value  # found at once from now on
+    return value
+
+
+def __dir__() -> list[str]:
+    """The public names too, imported or not."""
+    return sorted({*globals(), *__all__})

@@ -1,0 +1,505 @@
+"""The command line. What is heavy is imported by the command that needs it: help comes at once."""
+
+import argparse
+import contextlib
+import json
+import math
+import os
+import re
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NoReturn
+
+DONE, BAD_INPUT, NOT_CONVERGED, INTERRUPTED = 0, 2, 3, 130
+"""Exit statuses; 130 is what shells give for Ctrl-C."""
+
+PRIORS = ("none", "catalogue", "fixed-c3")
+"""Those of `fitting`, which is too heavy to be asked."""
+
+QUALITY = {"draft": 4, "standard": 16, "reference": 256}
+"""Samples per pixel of each preset."""
+
+WARM_RENDERS = 5
+"""Renders whose median is told as the time of one."""
+
+PIXEL_BYTES = 128
+"""Beside the radiance: places of a pixel and their order, while chunks are laid out."""
+SAMPLE_BYTES = 1024
+"""Of one path: its state of some hundred numbers. All samples of a pixel are traced at once."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        arguments: words after the program's name; by default those of the process.
+
+    Returns:
+        The exit status: 0 done, 2 bad input, 3 a fit that did not converge, 130 interrupted.
+    """
+    try:
+        options = _parser().parse_args(arguments)
+        with _plain_warnings():
+            status: int = options.run(options)
+            return status
+    except SystemExit as stop:  # of --help and --version
+        return stop.code if isinstance(stop.code, int) else 0
+    except KeyboardInterrupt:
+        return _complain("interrupted, nothing written", INTERRUPTED)
+    except MemoryError as error:
+        return _complain(f"not enough memory: {error}".removesuffix(": "))
+    except OSError as error:
+        return _complain(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+    except (ValueError, ImportError) as error:
+        return _complain(str(error))
+    except RuntimeError as error:
+        # How JAX tells that an allocation failed. Any other is a fault of ours.
+        if "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        return _complain(f"not enough memory: {str(error).splitlines()[0]}")
+
+
+def _complain(message: str, status: int = BAD_INPUT) -> int:
+    """Tell what is wrong."""
+    print(f"diffdisp: {message}", file=sys.stderr)
+    return status
+
+
+@contextlib.contextmanager
+def _plain_warnings() -> Iterator[None]:
+    """Warnings for users as one line each, and the same one only once."""
+    import logging
+
+    told = set()
+
+    def show(message: Warning | str, *_place: object, **_line: object) -> None:
+        if str(message) not in told:
+            told.add(str(message))
+            print(f"diffdisp: warning: {message}", file=sys.stderr)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        warnings.simplefilter("always", UserWarning)
+        # Of a folder that is full, say: the program is compiled again, and no result differs.
+        warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")
+        warnings.showwarning = show
+        # Tells of each folder that it cannot keep its lists of fonts in.
+        logging.getLogger("matplotlib").setLevel(logging.ERROR)
+        yield
+
+
+# Options.
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser whose mistakes are told in one line, as all others are."""
+
+    def __init__(self, **options: Any) -> None:
+        """As any parser; but a later option must not change what an abbreviation means."""
+        super().__init__(**options, allow_abbrev=False)
+
+    def error(self, message: str) -> NoReturn:
+        """Raise `ValueError` in the place of printing the usage and leaving."""
+        raise ValueError(f"{message}; see {self.prog} --help")
+
+
+class _Version(argparse.Action):
+    """`--version`: looked up only when asked for."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_rest: object) -> NoReturn:
+        """Print the version and leave."""
+        metadata = import_module("importlib.metadata")
+        try:
+            version = metadata.version("diffdisp")
+        except metadata.PackageNotFoundError:
+            version = "(not installed)"
+        print(f"diffdisp {version}")
+        parser.exit()
+
+
+def _parser() -> argparse.ArgumentParser:
+    """The command line's grammar."""
+    parser = _Parser(
+        prog="diffdisp",
+        description="Draw dispersive glass, and recover its Sellmeier coefficients from a picture.",
+    )
+    parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+    _add_render(commands.add_parser("render", help="draw a scene"))
+    _add_fit(commands.add_parser("fit", help="recover the glass of a ball from a picture"))
+    _add_glass(commands.add_parser("glass", help="print what is known of a glass"))
+    return parser
+
+
+def _add_render(parser: argparse.ArgumentParser) -> None:
+    parser.description = "Draw a scene: in linear sRGB, or the radiance in bands of wavelength."
+    parser.set_defaults(run=_render)
+    presets = ", ".join(f"{name} = {samples}" for name, samples in QUALITY.items())
+    add = parser.add_argument
+    add("scene", metavar="SCENE", help="a scene file, .toml")
+    add("-o", dest="output", metavar="OUT", help=".png (sRGB), .tiff or .exr (float32), .npz")
+    add("--size", type=_size, default=(480, 480), metavar="WxH", help="pixels (default 480x480)")
+    add("--quality", choices=QUALITY, default="standard", help=f"samples per pixel: {presets}")
+    add("--samples", type=_count, metavar="N", help="samples per pixel (default: by --quality)")
+    add("--depth", type=_depth, default=50, metavar="N", help="segments of a path (default 50)")
+    add("--bands", type=_bands, metavar="LOW:HIGH:COUNT", help=_BANDS_HELP)
+    add("--float64", action="store_true", help="compute in double precision (default: single)")
+    add("--seed", type=_seed, default=0, metavar="N", help="of random choices (default 0)")
+    add("--plan", action="store_true", help="print what the scene requires; draw only with -o")
+    add("--timing", action="store_true", help="also print how long it takes, as a line of JSON")
+
+
+_BANDS_HELP = "nm; equal bands, seen at their middles, as 400:700:16 (default: colour)"
+
+
+def _add_fit(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Recover B and C of a glass ball from a picture. The scene says where everything is and "
+        "which glass to start from. Exit status 3: it did not converge; the files are written."
+    )
+    parser.set_defaults(run=_fit)
+    add = parser.add_argument
+    add("scene", metavar="SCENE", help="a scene file, .toml")
+    add("target", metavar="TARGET", help="the picture: .npz, .tiff, .exr or .png")
+    add("-o", dest="output", metavar="DIR", required=True, help="for fit.json and report.png")
+    add("--object", metavar="NAME", help="the ball, where the scene has several of glass")
+    add("--prior", choices=PRIORS, default="none", help="what is known beforehand (default none)")
+    add("--noise", type=_noise, metavar="SIGMA", help="of the radiance (default: estimated)")
+    add("--start", metavar="GLASS", help="glass to start from (default: that of the scene)")
+
+
+def _add_glass(parser: argparse.ArgumentParser) -> None:
+    parser.description = "Print coefficients, n_d, V_d, P_gF, validity and source of a glass."
+    parser.set_defaults(run=_glass)
+    add = parser.add_argument
+    add("glass", metavar="GLASS", help="a name such as N-BK7, FILE.agf, FILE.agf:NAME or FILE.yml")
+    add("-o", dest="output", metavar="PLOT", help="draw n(λ) over the range of validity")
+
+
+def _whole(text: str, low: int, high: int) -> int:
+    """A whole number in plain digits from `low` to below `high`."""
+    # Python refuses to read thousands of digits, in words of its own.
+    number = int(text) if re.fullmatch(r"-?[0-9]{1,18}", text) else None
+    if number is None or not low <= number < high:
+        raise argparse.ArgumentTypeError(
+            f"must be a whole number of at least {low}, below {high}; found {text[:40]!r}"
+        )
+    return number
+
+
+def _count(text: str) -> int:
+    """A number of things that 32 bits can count."""
+    return _whole(text, 1, 2**31)
+
+
+def _depth(text: str) -> int:
+    """Segments of a path: no light is left of it long before the last of these."""
+    return _whole(text, 1, 2**16)
+
+
+def _seed(text: str) -> int:
+    """Any 32 bits."""
+    return _whole(text, 0, 2**32)
+
+
+def _size(text: str) -> tuple[int, int]:
+    """Width and height."""
+    width, times, height = text.partition("x")
+    if not times:
+        raise argparse.ArgumentTypeError(f"must be WxH, as 480x480; found {text!r}")
+    return _count(width), _count(height)
+
+
+def _real(text: str) -> float:
+    """A finite number."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise argparse.ArgumentTypeError(f"must be a finite number; found {text!r}")
+    return number
+
+
+def _noise(text: str) -> float:
+    """A standard deviation."""
+    sigma = _real(text)
+    if not sigma > 0:
+        raise argparse.ArgumentTypeError(f"must be above 0; found {text!r}")
+    return sigma
+
+
+def _bands(text: str) -> tuple[float, float, int]:
+    """Ends in nm and a count."""
+    parts = text.split(":")
+    if len(parts) != 3:
+        raise argparse.ArgumentTypeError(
+            f"must be LOW:HIGH:COUNT in nm, as 400:700:16; found {text!r}"
+        )
+    low, high, count = _real(parts[0]), _real(parts[1]), _count(parts[2])
+    if not 0 < low < high:
+        raise argparse.ArgumentTypeError(f"must rise from above 0; found {text!r}")
+    return low, high, count
+
+
+# Commands.
+
+
+def _render(options: argparse.Namespace) -> int:
+    """`diffdisp render`."""
+    if not options.output and (options.timing or not options.plan):
+        raise ValueError("render needs -o OUT; only --plan goes without a picture")
+    from diffdisp.image import Picture, check_output, write_picture
+    from diffdisp.planning import make_plan
+    from diffdisp.rendering import render
+    from diffdisp.scene_file import load_scene
+
+    scene = load_scene(options.scene)
+    samples = options.samples or QUALITY[options.quality]
+    depth, dtype = options.depth, "float64" if options.float64 else "float32"
+    film = _film(options.size, options.bands, samples)
+    if options.output:
+        check_output(options.output, film.wavelengths)
+    _check_glasses(scene, options.bands)
+    if options.plan:
+        print(make_plan(scene, film, samples, depth, dtype))
+    if not options.output:
+        return DONE
+    _keep_compiled()
+    draw = partial(
+        render, scene, film, samples=samples, depth=depth, seed=options.seed, dtype=dtype
+    )
+    paths = film.width * film.height * samples
+    radiance, timing = _timed(draw, paths) if options.timing else (_watched(draw), None)
+    picture = Picture(radiance, film.wavelengths, samples, depth, options.seed)
+    write_picture(options.output, picture)
+    if timing:
+        print(json.dumps(timing))
+    return DONE
+
+
+def _film(size: tuple[int, int], bands: tuple[float, float, int] | None, samples: int) -> Any:
+    """The film asked for, if there is memory for it."""
+    from diffdisp.film import Film, band_middles
+
+    _check_memory(*size, bands[2] if bands else 3, samples)
+    return Film(*size, band_middles(*bands) if bands else None)
+
+
+def _check_glasses(scene: Any, bands: tuple[float, float, int] | None) -> None:
+    """Check the range asked for, not the bands' middles: what is legal depends on no count."""
+    from diffdisp.rendering import COLOR_RANGE, check_glasses
+
+    low, high = (bands[0] / 1e3, bands[1] / 1e3) if bands else COLOR_RANGE
+    check_glasses(scene, low, high)
+    # `render` would say it again, of the middles.
+    warnings.filterwarnings("ignore", ".* reach beyond the range")
+
+
+def _watched(draw: Callable[..., Any]) -> Any:
+    """The picture, with a progress bar."""
+    with _progress_bar("rendering", "chunk") as bar:
+        return draw(progress=lambda done, total: _advance(bar, done, total))
+
+
+def _timed(draw: Callable[[], Any], paths: int) -> tuple[Any, dict[str, float]]:
+    """The picture, and how long it takes to compile and to draw."""
+    import resource
+    import statistics
+
+    seconds = []
+    for _ in range(1 + WARM_RENDERS):
+        start = time.perf_counter()
+        picture = draw()
+        seconds.append(time.perf_counter() - start)
+    warm = statistics.median(seconds[1:])
+    # Linux counts in KiB, macOS in bytes.
+    unit = 1 if sys.platform == "darwin" else 1024
+    return picture, {
+        "compile_s": max(seconds[0] - warm, 0.0),
+        "render_s": warm,
+        "paths": paths,
+        "paths_per_s": paths / warm,
+        "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6,
+    }
+
+
+def _fit(options: argparse.Namespace) -> int:
+    """`diffdisp fit`."""
+    folder = Path(options.output)
+    _check_folder(folder)
+    from diffdisp.fitting import fit
+    from diffdisp.glasses import load_glass
+    from diffdisp.image import read_picture
+    from diffdisp.report import result_table, write_fit_json, write_report
+    from diffdisp.scene_file import load_scene
+
+    scene, target = load_scene(options.scene), read_picture(options.target)
+    start = None if options.start is None else load_glass(options.start)
+    _keep_compiled()
+    with _progress_bar("fitting", "step") as bar:
+
+        def progress(step: int, residual: float, n_d: float) -> None:
+            bar.set_postfix_str(f"residual {residual:.3g}, n_d {n_d:.6f}", refresh=False)
+            _advance(bar, step, None)
+
+        result = fit(
+            scene,
+            target,
+            object_name=options.object,
+            prior=options.prior,
+            noise=options.noise,
+            start=start,
+            progress=progress,
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    write_report(folder / "report.png", result, target)
+    write_fit_json(folder / "fit.json", result)
+    print(result_table(result))
+    return DONE if result.converged else NOT_CONVERGED
+
+
+def _glass(options: argparse.Namespace) -> int:
+    """`diffdisp glass`."""
+    import jax
+
+    from diffdisp.glasses import load_glass, load_glasses
+
+    # A catalogue is printed whole, but a plot is of one glass.
+    if not options.output:
+        glasses = load_glasses(options.glass)
+    else:
+        from diffdisp.report import check_plot_output, write_glass_plot
+
+        check_plot_output(options.output)
+        glasses = [load_glass(options.glass)]
+    with jax.enable_x64(True):
+        print("\n\n".join(_glass_text(glass, options.glass) for glass in glasses))
+    if options.output:
+        write_glass_plot(options.output, glasses[0])
+    return DONE
+
+
+def _glass_text(glass: Any, asked_for: str) -> str:
+    """What is known of a glass, a line each."""
+    low, high = (float(edge) for edge in glass.validity)
+    rows = {
+        "glass": glass.name or "(unnamed)",
+        "B": _numbers(glass.B),
+        "C (µm²)": _numbers(glass.C),
+        "n_d": _number(glass.n_d, "{:.6f}"),
+        "V_d": _number(glass.V_d, "{:.3f}"),
+        "P_gF": _number(glass.P_gF, "{:.4f}"),
+        "validity": f"{low:g}-{high:g} µm" if math.isfinite(high) else "not stated",
+        "source": _source(asked_for),
+    }
+    return "\n".join(f"{name:<10}{text}" for name, text in rows.items())
+
+
+def _numbers(values: Any) -> str:
+    return "  ".join(f"{float(value):.9g}" for value in values)
+
+
+def _number(value: Any, form: str) -> str:
+    """A value, or why there is none."""
+    return form.format(float(value)) if math.isfinite(float(value)) else "not defined"
+
+
+def _source(asked_for: str) -> str:
+    """Where a glass of the table was published; of any other, the file it was read from."""
+    from diffdisp.glasses import glass_source
+
+    try:
+        return glass_source(asked_for)
+    except ValueError:
+        return asked_for
+
+
+# What the machine can do.
+
+
+def _check_memory(width: int, height: int, channels: int, samples: int) -> None:
+    """Refuse, before any work, a picture that cannot be held.
+
+    Raises:
+        MemoryError: it cannot.
+    """
+    # The radiance in the order of chunks and in that of rows, at most in double precision.
+    pixels = width * height * (2 * 8 * channels + PIXEL_BYTES)
+    needed, available = pixels + samples * channels * SAMPLE_BYTES, _available_memory()
+    if needed > available:
+        raise MemoryError(
+            f"{width}x{height} pixels of {channels} channels with {samples} samples need about "
+            f"{needed / 1e9:.3g} GB; available are {available / 1e9:.3g} GB"
+        )
+
+
+def _available_memory() -> int:
+    """Bytes that this process may still take, as far as the system says."""
+    limits = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
+    with contextlib.suppress(OSError, ValueError):  # "max" where a container sets no limit
+        limits.append(int(Path("/sys/fs/cgroup/memory.max").read_text()))
+    with contextlib.suppress(OSError):
+        found = re.search(r"MemAvailable: +(\d+) kB", Path("/proc/meminfo").read_text())
+        limits += [int(found[1]) * 1024] if found else []
+    return min(limits)
+
+
+def _check_folder(folder: Path) -> None:
+    """Raise now what making a folder and writing into it would raise after a long fit.
+
+    Raises:
+        ValueError: something on the way is no folder, or may not be written to.
+    """
+    nearest = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    if not nearest.is_dir():
+        raise ValueError(f"{folder}: {nearest} is no folder")
+    if not os.access(nearest, os.W_OK | os.X_OK):
+        raise ValueError(f"{folder}: the folder {nearest} may not be written to")
+    for name in ("fit.json", "report.png"):
+        if (folder / name).is_dir():
+            raise ValueError(f"{folder / name}: is a folder")
+
+
+def _keep_compiled() -> None:
+    """Let JAX keep compiled programs between runs, which saves most of a short run's time."""
+    import jax
+
+    config: Any = jax.config
+    if config.jax_compilation_cache_dir is None:
+        home = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+        folder = Path(home).expanduser() / "diffdisp" / "jax"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except (OSError, RuntimeError):  # RuntimeError: nobody knows where home is
+            return
+        if not os.access(folder, os.W_OK | os.X_OK):
+            return
+        config.update("jax_compilation_cache_dir", str(folder))
+    # JAX keeps only what took a second to compile; what somebody has set already stays.
+    if config.jax_persistent_cache_min_compile_time_secs == 1.0:
+        config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    if config.jax_persistent_cache_min_entry_size_bytes == 0:
+        config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def _progress_bar(title: str, unit: str) -> Any:
+    """A bar on a terminal; nothing elsewhere."""
+    from tqdm import tqdm
+
+    return tqdm(desc=title, unit=unit, leave=False, file=sys.stderr, disable=None)
+
+
+def _advance(bar: Any, done: int, total: int | None) -> None:
+    """Set a bar to `done` of `total`."""
+    bar.total = total
+    bar.update(done - bar.n)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

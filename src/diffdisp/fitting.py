@@ -1,0 +1,1034 @@
+"""From a picture to a glass: the coefficients of one ball by least squares, and their errors.
+
+A picture knows a glass only by its index at the film's wavelengths. So each step traces once: the
+picture and its slope ∂L/∂n there. What is left, to find B and C whose n(λ) lowers the linearised
+sum of squares, has a handful of rows and needs no picture: optimistix solves it, non-linear and
+ill-conditioned as it is, in milliseconds.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Float
+
+from diffdisp.color import albedo_basis, wavelength_strata
+from diffdisp.dispersion import LINE_C, LINE_D, LINE_F, LINE_G, Sellmeier, domain_error
+from diffdisp.film import Film
+from diffdisp.glasses import glass_table
+from diffdisp.image import Picture
+from diffdisp.integrator import lane_radiance
+from diffdisp.planning import Plan, make_plan
+from diffdisp.rendering import (
+    COLOR_RANGE,
+    WIDE_VECTORS,
+    Pixels,
+    RunNumbers,
+    Spectrum,
+    check_glasses,
+    chunk_lanes,
+    chunk_pixels,
+    combine,
+    each_chunk,
+    film_range,
+    film_size,
+    film_spectrum,
+    glass_indices,
+    in_dtype,
+    over_chunks,
+    run_numbers,
+    some_blocks,
+)
+from diffdisp.scene import Scene, is_glass, object_glass, with_glass
+
+ASSUMED_NOISE = 1e-3
+"""Noise that errors refer to where a picture shows none: that of a good camera, in radiance."""
+
+INDEX_GRID = np.geomspace(1.2, 2.7, 128)
+"""Indices at which a coarse picture is traced to find where to start."""
+
+COARSE_PIXELS = 32
+"""Blocks along the longer side of the coarsest picture."""
+
+SAMPLES = (16, 144)
+"""Film samples per pixel of the last level, where the target does not say its own: of most pixels,
+and of those that more samples change most."""
+
+REFINED = 1 / 3
+"""Part of the pixels that show the ball that get the more samples."""
+
+DETERMINED = 0.1
+"""A direction of log B, log C counts as determined when its standard deviation is below this."""
+
+WIDEST = 10.0
+"""Standard deviation in log B, log C about the start of what a picture says nothing of: a factor
+of 20 000 either way, beyond any glass and beyond what a linear error can mean. It keeps fits from
+running away and bounds the errors reported; next to anything that a picture tells it is nothing."""
+
+CLEAN = 1e-5
+"""A residual below this part of the brightest value is no noise of a camera."""
+
+SMALL_STEP = 0.03
+"""A step that changes the picture by less than this part of its noise ends the fit."""
+
+LEAST_CHANGE = 1e-13
+"""Changes of n below this are rounding."""
+
+DEBUG = False
+PRIORS = ("none", "catalogue", "fixed-c3")
+
+COLOR_WAVELENGTHS = np.arange(430, 681, 10) / 1e3
+"""Where a fit to a colour picture reports n(λ), µm: beyond, sRGB sees almost nothing."""
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """What a picture says about a glass.
+
+    Args:
+        scene: the scene with the fitted glass.
+        glass: the fitted glass.
+        object_name: name of the ball made of it.
+        converged: whether a minimum was reached that explains the picture.
+        message: why, or why not.
+        steps: traced pictures of the last level.
+        B: (3,) dimensionless.
+        C: (3,) µm².
+        B_std: (3,) one standard deviation; 0 where held fixed.
+        C_std: (3,) one standard deviation, µm².
+        covariance: (6, 6) of B1 B2 B3 C1 C2 C3.
+        n_d: index at the d line.
+        n_d_std: one standard deviation.
+        V_d: Abbe number.
+        V_d_std: one standard deviation.
+        P_gF: relative partial dispersion.
+        P_gF_std: one standard deviation.
+        wavelengths: (K,) µm, of `n`.
+        n: (K,) fitted index.
+        n_std: (K,) one standard deviation.
+        singular_values: of the Jacobian in log B, log C over the noise: one over the standard
+            deviation of each direction.
+        determined: how many of them are known to better than 0.1.
+        summary: the same in a sentence.
+        rms_residual: root mean square of picture minus target.
+        nearest_glasses: names of catalogue glasses and their distance in standard deviations.
+        prior: "none", "catalogue" or "fixed-c3".
+        noise: the noise that the errors refer to; None where it was estimated from the residual.
+        samples: film samples per pixel of the last level: of most pixels, of the hardest.
+        picture: (height, width, channels) render with the fitted glass.
+    """
+
+    scene: Scene
+    glass: Sellmeier
+    object_name: str
+    converged: bool
+    message: str
+    steps: int
+    B: np.ndarray
+    C: np.ndarray
+    B_std: np.ndarray
+    C_std: np.ndarray
+    covariance: np.ndarray
+    n_d: float
+    n_d_std: float
+    V_d: float
+    V_d_std: float
+    P_gF: float
+    P_gF_std: float
+    wavelengths: np.ndarray
+    n: np.ndarray
+    n_std: np.ndarray
+    singular_values: np.ndarray
+    determined: int
+    summary: str
+    rms_residual: float
+    nearest_glasses: tuple[tuple[str, float], ...]
+    prior: str
+    noise: float | None
+    samples: tuple[int, ...]
+    picture: np.ndarray
+
+
+class Coefficients(eqx.Module):
+    """Coordinates of B and C without bounds: no value of them puts a pole into the band.
+
+    log |B| keeps the sign; C below the band is low²·sigmoid, above it high²·(1 + exp). What is
+    not free keeps its value: B = 0, C ≤ 0, and C₃ under that prior.
+
+    Args:
+        B: (3,) start.
+        C: (3,) start, µm².
+        low: shortest wavelength, µm.
+        high: longest wavelength, µm.
+        free: which of B1 B2 B3 C1 C2 C3 are free.
+    """
+
+    B: np.ndarray
+    C: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    free: tuple[bool, ...] = eqx.field(static=True)
+
+    def start(self) -> np.ndarray:
+        """Coordinates (free,) of the start."""
+        below, above = self.C / self.low**2, self.C / self.high**2 - 1
+        C = np.where(self.C < self.low**2, _log(below) - _log(1 - below), _log(above))
+        return np.concatenate([_log(np.abs(self.B)), C])[list(self.free)]
+
+    def values(self, z: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """B and C (3,) at coordinates `z` (free,)."""
+        free = np.array(self.free)
+        full = jnp.zeros(6).at[np.flatnonzero(free)].set(z)
+        below = self.C < self.low**2
+        B = jnp.sign(self.B) * jnp.exp(full[:3])
+        above = self.high**2 * (1 + jnp.exp(jnp.where(below, 0.0, full[3:])))
+        C = jnp.where(below, self.low**2 * jax.nn.sigmoid(full[3:]), above)
+        return jnp.where(free[:3], B, self.B), jnp.where(free[3:], C, self.C)
+
+    def index(self, z: jax.Array, wavelengths: jax.Array | np.ndarray) -> jax.Array:
+        """n (k,) at `wavelengths` (k,), µm; continued smoothly where n² would fall below 1/4."""
+        B, C = self.values(z)
+        squared = jnp.asarray(wavelengths)[:, None] ** 2
+        zero = (B == 0)[None, :]
+        terms = jnp.where(zero, 0.0, B[None] * squared / jnp.where(zero, 1.0, squared - C[None]))
+        n_squared = 1 + jnp.sum(terms, axis=-1)
+        low = 0.25 * jnp.exp(jnp.minimum(n_squared / 0.25 - 1, 0.0))
+        return jnp.sqrt(jnp.where(n_squared > 0.25, n_squared, low))
+
+    def logarithms(self, z: jax.Array) -> jax.Array:
+        """log |B| and log C (free,) at `z`, in which results are reported."""
+        B, C = self.values(z)
+        return jnp.log(jnp.abs(jnp.concatenate([B, C])[np.flatnonzero(self.free)]))
+
+
+def _log(x: np.ndarray) -> np.ndarray:
+    """log of the positive ones; 0 for the others, which are held fixed."""
+    return np.log(np.where(x > 0, x, 1.0))
+
+
+class Unknowns(NamedTuple):
+    """What is looked for: n(λ) through B and C.
+
+    A change of n(λ) has `m` coordinates: its values at the bands, or for a colour film, which
+    sees many wavelengths at once, the coefficients of Chebyshev polynomials.
+
+    Args:
+        coefficients: coordinates of B and C.
+        reference: (k,) µm, wavelengths that represent n(λ).
+        project: (m, k) from a change of n at `reference` to its coordinates.
+        prior_mean: (rows,) of what a prior knows.
+        prior_rows: (rows, free) rows · logarithms - mean has unit variance under the prior.
+    """
+
+    coefficients: Coefficients
+    reference: np.ndarray
+    project: np.ndarray
+    prior_mean: np.ndarray
+    prior_rows: np.ndarray
+
+    def change(self, z: jax.Array, index: jax.Array) -> jax.Array:
+        """Coordinates (m,) of the change from `index` at the reference wavelengths to n at `z`."""
+        return self.project @ (self.coefficients.index(z, self.reference) - index)
+
+
+class Problem(NamedTuple):
+    """What stays the same through a fit.
+
+    Args:
+        scene: the scene; its ball's glass is replaced.
+        number: number of the ball among the objects.
+        ball: its number among those of glass.
+        film: the target's.
+        target: (height, width, channels).
+        unknowns: what is looked for.
+        progress: called with the step, the root mean square residual and n_d.
+    """
+
+    scene: Scene
+    number: int
+    ball: int
+    film: Film
+    target: np.ndarray
+    unknowns: Unknowns
+    progress: Callable[[int, float, float], None]
+
+
+class Part(NamedTuple):
+    """Blocks of pixels that are rendered alike.
+
+    Args:
+        plan: static choices of the render.
+        spectrum: the film's.
+        chunks: the blocks.
+        place: (blocks,) where each one stands among the chunks' pixels.
+        rows: (blocks,) their rows in the level's target.
+        tangents: (t, *wavelengths) changes of n along which the picture is differentiated.
+    """
+
+    plan: Plan
+    spectrum: Spectrum
+    chunks: Pixels
+    place: np.ndarray
+    rows: np.ndarray
+    tangents: np.ndarray
+
+
+class Level(NamedTuple):
+    """One resolution of the problem.
+
+    Args:
+        parts: what renders it; together they cover every block once.
+        target: (blocks, channels).
+        seed: of the render.
+    """
+
+    parts: tuple[Part, ...]
+    target: np.ndarray
+    seed: int
+
+
+class Linearised(NamedTuple):
+    """A picture linearised in the index: residual + J a, and J = Q R.
+
+    Args:
+        r: (m, m) R.
+        q: (m,) Qᵀ residual.
+        meat: (m, m) Qᵀ diag(residual²) Q: how the noise that is there enters q.
+        cost: sum of squared residuals.
+        seen: number of residuals that depend on the index.
+        noise: root mean square of those.
+        rms: root mean square of all residuals.
+        explained: part of the variance of what depends on the index that the render explains.
+        depends: (blocks,) whether the index changes a block.
+        picture: (blocks, channels) the render.
+    """
+
+    r: np.ndarray
+    q: np.ndarray
+    meat: np.ndarray
+    cost: float
+    seen: int
+    noise: float
+    rms: float
+    explained: float
+    depends: np.ndarray
+    picture: np.ndarray
+
+
+def fit(
+    scene: Scene,
+    target: Picture,
+    *,
+    object_name: str | None = None,
+    prior: str = "none",
+    noise: float | None = None,
+    start: Sellmeier | None = None,
+    progress: Callable[[int, float, float], None] | None = None,
+) -> FitResult:
+    """The Sellmeier coefficients of a glass ball from a picture of it, in float64.
+
+    Args:
+        scene: what the picture shows; the ball's glass in it is where the fit starts.
+        target: the picture; its film is the fit's. Its `samples`, `depth` and `seed` are used in
+            the last level where it has them.
+        object_name: the ball, where the scene has several of glass.
+        prior: "none"; "catalogue", a Gaussian in log B, log C over the table's glasses;
+            "fixed-c3", which holds C₃ at its start.
+        noise: standard deviation of the target's values where it is known; otherwise errors are
+            estimated from the residual, heteroscedasticity-consistent.
+        start: a glass to start from instead of the scene's.
+        progress: called with the step, the root mean square residual and n_d.
+
+    Returns:
+        The glass, its errors and how the fit ended; look at `converged`.
+
+    Raises:
+        ValueError: no such glass ball, or several and no name; a start with a pole in the band or
+            without any free coefficient; an unknown prior; a noise that is not positive.
+    """
+    if prior not in PRIORS:
+        raise ValueError(f"prior {prior!r}: allowed are {', '.join(PRIORS)}")
+    if noise is not None and not (np.isfinite(noise) and noise > 0):
+        raise ValueError(f"noise {noise}: must be a finite number above 0")
+    number = _glass_object(scene, object_name)
+    if start is not None:
+        scene = with_glass(scene, number, start)
+    film = target.film
+    check_glasses(scene, *film_range(film))
+    with jax.enable_x64(True):
+        problem = _problem(scene, number, target, prior, progress or _silent)
+        return _fit(problem, target, prior, noise)
+
+
+def _silent(step: int, rms: float, n_d: float) -> None:
+    """No progress wanted."""
+
+
+def _glass_object(scene: Scene, name: str | None) -> int:
+    """Number of the glass ball called `name`, or of the only one."""
+    glasses = [i for i, obj in enumerate(scene.objects) if is_glass(obj)]
+    if not glasses:
+        raise ValueError("the scene has no glass ball to fit")
+    names = [scene.objects[i].name or f"object[{i}]" for i in glasses]
+    if name is None and len(glasses) > 1:
+        raise ValueError(f"the scene has several glass balls, name one: {', '.join(names)}")
+    if name is not None and name not in names:
+        raise ValueError(f"no glass ball is called {name!r}: allowed are {', '.join(names)}")
+    return glasses[0 if name is None else names.index(name)]
+
+
+def _problem(
+    scene: Scene,
+    number: int,
+    target: Picture,
+    prior: str,
+    progress: Callable[[int, float, float], None],
+) -> Problem:
+    film = target.film
+    glass = object_glass(scene, number)
+    low, high = film_range(film)
+    B, C = np.asarray(glass.B, np.float64), np.asarray(glass.C, np.float64)
+    free = (B != 0) & (C > 0)
+    mask = np.concatenate([free, free])
+    if prior == "fixed-c3":
+        mask[5] = False
+    if not mask.any():
+        raise ValueError("the start has no term with B ≠ 0 and C > 0: nothing is free")
+    coefficients = Coefficients(B, C, np.asarray(low), np.asarray(high), tuple(mask.tolist()))
+    if film.wavelengths is None:
+        reference = np.linspace(*COLOR_RANGE, 33)
+        # Beyond the middle of the visible sRGB sees little: what n does there counts less.
+        project = np.linalg.pinv(_polynomials(reference).T)
+    else:
+        reference = np.asarray(film.wavelengths)
+        project = np.eye(len(reference))
+    mean, rows = _prior(prior, C, mask)
+    ball = [i for i, obj in enumerate(scene.objects) if is_glass(obj)].index(number)
+    unknowns = Unknowns(coefficients, reference, project, mean, rows)
+    return Problem(scene, number, ball, film, target.radiance, unknowns, progress)
+
+
+def _polynomials(wavelengths: np.ndarray) -> np.ndarray:
+    """Chebyshev polynomials (6, ...) over the visible: a change of n(λ) needs no more."""
+    middle, half = sum(COLOR_RANGE) / 2, (COLOR_RANGE[1] - COLOR_RANGE[0]) / 2
+    columns = np.polynomial.chebyshev.chebvander((wavelengths - middle) / half, 5)
+    return np.moveaxis(columns, -1, 0)
+
+
+def _prior(prior: str, C: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and whitening rows of the logarithms under the catalogue; no rows for other priors."""
+    if prior != "catalogue":
+        return np.zeros(0), np.zeros((0, int(mask.sum())))
+    if not mask.all():
+        raise ValueError("the catalogue prior needs a start of three terms with B, C above 0")
+    glasses = [g for g in glass_table().values() if np.all(np.r_[g.B, g.C] > 0)]
+    logs = np.log([np.concatenate([g.B, g.C])[_by_C(g.C)] for g in glasses])
+    mean, whiten = logs.mean(0), np.linalg.inv(np.linalg.cholesky(np.cov(logs.T)))
+    order = _by_C(C)
+    rows = np.zeros((6, 6))
+    rows[:, order] = whiten
+    return whiten @ mean, rows
+
+
+def _by_C(C: np.ndarray) -> np.ndarray:
+    """Order (6,) of B1 B2 B3 C1 C2 C3 in which C rises."""
+    order = np.argsort(C)
+    return np.concatenate([order, order + 3])
+
+
+def _level(problem: Problem, size: int, samples: int, depth: int, seed: int) -> Level:
+    """The problem in blocks of `size` pixels; what fills no block at the border is left out."""
+    film, target = problem.film, problem.target
+    width, height = film.width // size, film.height // size
+    cut = target[: height * size, : width * size]
+    means = cut.reshape(height, size, width, size, -1).mean((1, 3)).reshape(height * width, -1)
+    part = _part(problem, size, samples, depth, np.arange(height * width))
+    return Level((part,), means, seed)
+
+
+def _part(problem: Problem, size: int, samples: int, depth: int, rows: np.ndarray) -> Part:
+    """The blocks of `size` pixels with numbers `rows`, at `samples` samples."""
+    film = problem.film
+    plan = replace(make_plan(problem.scene, film, samples, depth, "float64"), dispersive=True)
+    spectrum = film_spectrum(film, plan)
+    chunks, place = some_blocks(rows, film.width // size, size, chunk_pixels(film, plan))
+    if film.wavelengths is None:
+        tangents = _polynomials(np.asarray(spectrum.wavelengths))
+    else:
+        tangents = np.ones((1, film.channels))
+    return Part(plan, spectrum, chunks, place, rows, tangents)
+
+
+def _refined(problem: Problem, level: Level, z: np.ndarray, samples: int) -> Level:
+    """The level with more samples where few are not enough.
+
+    Near the rim a ball shows the whole scene within a few pixels, and there the footprints of a
+    picture's samples are neither small nor straight. The pixels that more samples change most are
+    those that need still more.
+    """
+    part = level.parts[0]
+    plan = part.plan
+    few = _level(problem, 1, plan.samples // 4, plan.depth, level.seed)
+    pictures = [_linearise(problem, some, z, 1e-3) for some in (few, level)]
+    change = np.max(np.abs(pictures[0].picture - pictures[1].picture), axis=1)
+    many = np.argsort(-change)[: int(np.sum(pictures[1].depends) * REFINED)]
+    hard = np.zeros(len(change), bool)
+    hard[many] = True
+    parts = tuple(
+        _part(problem, 1, count, plan.depth, np.flatnonzero(rows))
+        for count, rows in ((plan.samples, ~hard), (samples, hard))
+        if rows.any()
+    )
+    return level._replace(parts=parts)
+
+
+def _traced(
+    plan: Plan,
+    ball: int,
+    scene: Scene,
+    spectrum: Spectrum,
+    size: tuple[jax.Array, jax.Array],
+    chunks: Pixels,
+    run: RunNumbers,
+    index: jax.Array,
+    tangents: jax.Array,
+) -> jax.Array:
+    """Pixels (chunks, pixels, 1 + t, channels): radiance, and its change along each tangent."""
+    scene, spectrum, size, chunks, run = in_dtype(
+        (scene, spectrum, size, chunks, run), plan.dtype
+    )
+    indices = glass_indices(scene, spectrum.wavelengths)
+
+    def chunk(pixels: Pixels) -> jax.Array:
+        lanes = chunk_lanes(plan, scene, spectrum, size, pixels, run)
+
+        def of_index(index: jax.Array) -> jax.Array:
+            changed = (*indices[:ball], index, *indices[ball + 1 :])
+            return combine(lane_radiance(plan, changed, lanes), spectrum)
+
+        def change(tangent: jax.Array) -> tuple[jax.Array, jax.Array]:
+            return jax.jvp(of_index, (index,), (tangent,))
+
+        value, slopes = jax.vmap(change, out_axes=(None, 0))(tangents)
+        return jnp.moveaxis(jnp.concatenate([value[None], slopes], axis=0), 0, 1)
+
+    return each_chunk(chunk, chunks)
+
+
+_traced_jit = jax.jit(_traced, static_argnums=(0, 1), compiler_options=WIDE_VECTORS)
+
+
+def _trace(
+    problem: Problem, part: Part, z: np.ndarray, seed: int, cutoff: float
+) -> Float[np.ndarray, "blocks derivatives channels"]:
+    """Radiance of a part's blocks, and its change along each tangent."""
+    waves = np.asarray(part.spectrum.wavelengths)
+    index = np.asarray(problem.unknowns.coefficients.index(z, waves.ravel())).reshape(waves.shape)
+    size, run = film_size(problem.film), run_numbers(part.plan, seed, cutoff)
+
+    def trace(chunks: Pixels) -> np.ndarray:
+        fixed = (problem.scene, part.spectrum, size, chunks, run, index, part.tangents)
+        return np.asarray(_traced_jit(part.plan, problem.ball, *fixed))
+
+    values = over_chunks(trace, part.chunks, "float64")
+    return values.reshape(-1, *values.shape[2:])[part.place]
+
+
+def _linearise(problem: Problem, level: Level, z: np.ndarray, cutoff: float) -> Linearised:
+    """The picture and its slopes at coordinates `z`, reduced to what a step needs."""
+    values = [_trace(problem, part, z, level.seed, cutoff) for part in level.parts]
+    order = np.argsort(np.concatenate([part.rows for part in level.parts]))
+    joined = np.concatenate(values)[order]
+    picture, slopes = joined[:, 0], joined[:, 1:]
+    residual = picture - level.target
+    seen = np.any(slopes != 0, axis=1)
+    depends = np.any(seen, axis=1)
+    cost, m = float(np.sum(residual**2)), len(problem.unknowns.project)
+    if problem.film.wavelengths is None:
+        rows = np.moveaxis(slopes, 1, -1).reshape(-1, m)
+        basis, r = np.linalg.qr(rows)
+        flat = residual.ravel()
+        q, meat = basis.T @ flat, (basis * flat[:, None] ** 2).T @ basis
+    else:
+        # A band depends on the index at its own wavelength alone: J is one column a band.
+        norms = np.sqrt(np.sum(slopes[:, 0] ** 2, axis=0))
+        basis = slopes[:, 0] / np.where(norms > 0, norms, 1.0)
+        r, q = np.diag(norms), np.sum(basis * residual, axis=0)
+        meat = np.diag(np.sum((basis * residual) ** 2, axis=0))
+    count = int(seen.sum())
+    noise = np.sqrt(np.sum(residual[seen] ** 2) / max(count - m, 1))
+    rms = np.sqrt(np.mean(residual**2))
+    contrast = np.sum((level.target[seen] - np.mean(level.target[seen])) ** 2) if count else 1.0
+    explained = 1 - float(np.sum(residual[seen] ** 2)) / max(float(contrast), 1e-300)
+    return Linearised(r, q, meat, cost, count, float(noise), float(rms), explained, depends, picture)
+
+
+class Step(NamedTuple):
+    """A least-squares problem without a picture, in whitened coordinates y: z = z0 + W y.
+
+    Args:
+        unknowns: what is looked for.
+        z0: (free,) where the picture was linearised.
+        whiten: (free, free) W.
+        index: (k,) n at the reference wavelengths there.
+        r: (m, m) as in `Linearised`.
+        q: (m,) as in `Linearised`.
+        damping: (m,) weights that keep the change of n within what a linear picture can tell.
+        anchor: (free,) where z stays if the picture says nothing.
+        near: weight of that.
+        prior: weight of the prior's rows.
+    """
+
+    unknowns: Unknowns
+    z0: jax.Array
+    whiten: jax.Array
+    index: jax.Array
+    r: jax.Array
+    q: jax.Array
+    damping: jax.Array
+    anchor: jax.Array
+    near: jax.Array
+    prior: jax.Array
+
+
+def _step_rows(y: jax.Array, step: Step) -> jax.Array:
+    """Residuals (rows,) of a step."""
+    unknowns, z = step.unknowns, step.z0 + step.whiten @ y
+    change = unknowns.change(z, step.index)
+    logs = unknowns.prior_rows @ unknowns.coefficients.logarithms(z) - unknowns.prior_mean
+    return jnp.concatenate(
+        [
+            step.r @ change + step.q,
+            step.damping * change,
+            step.near * (z - step.anchor),
+            step.prior * logs,
+        ]
+    )
+
+
+@jax.jit
+def _solve_step(step: Step) -> jax.Array:
+    """Coordinates z (free,) that a step leads to.
+
+    The directions in which n(λ) hardly changes are long curved valleys. Levenberg-Marquardt walks
+    along one in a thousand steps or so of 20 µs; dogleg steps crawl there for tens of thousands.
+    Whether the solver met its tolerance does not matter here: a step that is not the best still
+    has to lower the picture's own sum of squares, and the next one starts from it.
+    """
+    solver = optx.LevenbergMarquardt(rtol=1e-12, atol=1e-12)
+    solution = optx.least_squares(
+        _step_rows, solver, jnp.zeros_like(step.z0), args=step, max_steps=20_000, throw=False
+    )
+    return step.z0 + step.whiten @ solution.value
+
+
+def _next_z(
+    unknowns: Unknowns, z: np.ndarray, anchor: np.ndarray, lin: Linearised, damping: float
+) -> np.ndarray:
+    """The coordinates that the picture linearised at `z` asks for."""
+    index = unknowns.coefficients.index(z, unknowns.reference)
+    slope = np.asarray(jax.jacfwd(lambda z: unknowns.change(z, index))(jnp.asarray(z)))
+    _, scales, right = np.linalg.svd(lin.r @ slope, full_matrices=True)
+    scales = np.append(scales, np.zeros(len(z) - len(scales)))
+    near = lin.noise / WIDEST
+    # Whitened: a unit of y weighs alike in every direction, in the picture or by nearness.
+    scales = np.maximum(np.hypot(scales, near), max(1e-12 * scales[0], 1e-300))
+    size = max(float(np.linalg.norm(lin.q)), 1e-300)
+    step = Step(
+        unknowns,
+        z,
+        right.T * (size / scales),
+        index,
+        lin.r / size,
+        lin.q / size,
+        np.sqrt(damping) * np.sqrt(np.sum(lin.r**2, axis=0)) / size,
+        anchor,
+        np.asarray(near / size),
+        np.asarray(lin.noise / size),
+    )
+    return np.asarray(_solve_step(step))
+
+
+def _objective(unknowns: Unknowns, lin: Linearised, z: np.ndarray, anchor: np.ndarray, noise: float) -> float:
+    """What a step has to lower: squared residuals, and what is known besides, in their unit."""
+    known = unknowns.prior_rows @ np.asarray(unknowns.coefficients.logarithms(z))
+    far = np.sum(((z - anchor) / WIDEST) ** 2) + np.sum((known - unknowns.prior_mean) ** 2)
+    return lin.cost + noise**2 * float(far)
+
+
+class Descent(NamedTuple):
+    """Where a level's steps ended.
+
+    Args:
+        z: (free,) coordinates.
+        lin: the picture linearised there.
+        steps: pictures traced.
+        converged: whether a next step would change nothing that the picture can tell.
+    """
+
+    z: np.ndarray
+    lin: Linearised
+    steps: int
+    converged: bool
+
+
+def _descend(
+    problem: Problem, level: Level, z: np.ndarray, cutoff: float, most: int, small: float
+) -> Descent:
+    """Gauss-Newton steps from `z`, `most` at most, until one is small.
+
+    Args:
+        problem: what stays the same.
+        level: the resolution.
+        z: coordinates to start from.
+        cutoff: part of its light with which a path ends.
+        most: pictures to trace at most.
+        small: a step that changes the picture by less than this part of its noise is the last.
+    """
+    unknowns = problem.unknowns
+    lin, damping, converged = _linearise(problem, level, z, cutoff), 0.0, False
+    steps, anchor = 1, z
+    while steps < most and not converged:
+        problem.progress(steps, lin.rms, _n_d(unknowns, z))
+        index = np.asarray(unknowns.coefficients.index(z, unknowns.reference))
+        new = _next_z(unknowns, z, anchor, lin, damping)
+        change = np.asarray(unknowns.change(new, index))
+        largest = np.max(np.abs(unknowns.coefficients.index(new, unknowns.reference) - index))
+        visible = np.linalg.norm(lin.r @ change)
+        if largest < LEAST_CHANGE or visible < small * lin.noise:
+            # So near the next picture would be the same: it need not be traced.
+            z, converged = new, True
+            break
+        tried = _linearise(problem, level, new, cutoff)
+        steps += 1
+        before, after = (
+            _objective(unknowns, picture, at, anchor, lin.noise)
+            for picture, at in ((lin, z), (tried, new))
+        )
+        if DEBUG: print('   try', steps, 'obj', before, after-before, 'visible', visible/lin.noise, 'largest', largest, 'damp', damping, 'z', z)
+        if after <= before:
+            z, lin, damping = new, tried, damping / 10 if damping > 1e-2 else 0.0
+        elif largest < 100 * LEAST_CHANGE:
+            converged = True  # what is left of the residual is rounding
+        else:
+            damping = max(10 * damping, 1.0)
+    return Descent(z, lin, steps, converged)
+
+
+def _n_d(unknowns: Unknowns, z: np.ndarray) -> float:
+    return float(unknowns.coefficients.index(z, np.array([LINE_D]))[0])
+
+
+def _starts(problem: Problem, level: Level, most: int) -> list[np.ndarray]:
+    """Coordinates to start from: those that explain a coarse picture best.
+
+    The coarse picture is traced once at many indices. Any glass's picture is then an
+    interpolation between them, so hundreds of glasses cost nothing: the start with its B scaled
+    to other indices and its resonances below the band moved to other dispersions.
+    """
+    unknowns, film = problem.unknowns, problem.film
+    table = _index_table(problem, level)
+    waves, weights, columns = _few_wavelengths(film)
+    target = level.target[:, columns]
+    found = []
+    for z in _variants(unknowns, waves):
+        index = np.asarray(unknowns.coefficients.index(z, waves))
+        if index.min() < INDEX_GRID[0] or index.max() >= INDEX_GRID[-1]:
+            continue
+        place = np.interp(index, INDEX_GRID, np.arange(len(INDEX_GRID)))
+        left = np.minimum(place.astype(int), len(INDEX_GRID) - 2)
+        part = (place - left)[:, None, None]
+        seen = table[left] * (1 - part) + table[left + 1] * part
+        picture = np.einsum("jpc,jcd->pd", seen, weights, optimize=True)
+        found.append((float(np.sum((picture - target) ** 2)), np.mean(index), z))
+    found.sort(key=lambda entry: entry[0])
+    chosen: list[tuple[float, float, np.ndarray]] = []
+    for entry in found:
+        if len(chosen) < most and all(abs(entry[1] - c[1]) > 0.03 for c in chosen):
+            chosen.append(entry)
+    return [z for _, _, z in chosen] or [unknowns.coefficients.start()]
+
+
+def _index_table(problem: Problem, level: Level) -> np.ndarray:
+    """Linear sRGB (indices, blocks, 3) of a level's picture at each index of the grid."""
+    middle = sum(film_range(problem.film)) / 2
+    part = level.parts[0]
+    plan = replace(part.plan, colour=True, dispersive=False, samples=4)
+    # Without dispersion a plan has one path for all wavelengths: here it is one for each index.
+    spectrum = Spectrum(np.full(len(INDEX_GRID), middle), None, None)
+    size, run = film_size(problem.film), run_numbers(plan, level.seed, 1e-3)
+    edge = int(part.chunks.size)
+    chunks, place = some_blocks(part.rows, problem.film.width // edge, edge, 4)
+
+    def trace(chunks: Pixels) -> np.ndarray:
+        return np.asarray(
+            _traced_at_indices(plan, problem.ball, problem.scene, spectrum, size, chunks, run)
+        )
+
+    values = over_chunks(trace, chunks, "float64")
+    return np.moveaxis(values.reshape(-1, len(INDEX_GRID), 3)[place], 1, 0)
+
+
+@partial(jax.jit, static_argnums=(0, 1), compiler_options=WIDE_VECTORS)
+def _traced_at_indices(
+    plan: Plan,
+    ball: int,
+    scene: Scene,
+    spectrum: Spectrum,
+    size: tuple[jax.Array, jax.Array],
+    chunks: Pixels,
+    run: RunNumbers,
+) -> jax.Array:
+    """Pixels (chunks, pixels, indices, 3) with one ball at each index of the grid."""
+    scene, spectrum, size, chunks, run = in_dtype(
+        (scene, spectrum, size, chunks, run), plan.dtype
+    )
+    indices = glass_indices(scene, spectrum.wavelengths)
+    indices = (*indices[:ball], jnp.asarray(INDEX_GRID), *indices[ball + 1 :])
+
+    def chunk(pixels: Pixels) -> jax.Array:
+        lanes = chunk_lanes(plan, scene, spectrum, size, pixels, run)
+        return jnp.moveaxis(lane_radiance(plan, indices, lanes)[:, 0], 0, 1)
+
+    return each_chunk(chunk, chunks)
+
+
+def _few_wavelengths(film: Film) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """At most 16 wavelengths (j,) for a coarse picture, how they mix, and into which channels.
+
+    Returns:
+        Wavelengths in µm; weights (j, 3, d) from linear sRGB at each into d of the film's
+        channels; and the numbers (d,) of those.
+    """
+    if film.wavelengths is None:
+        waves, share = wavelength_strata(16)
+        return waves, share[:, :, None] * np.eye(3)[None], np.arange(3)
+    columns = np.unique(np.linspace(0, film.channels - 1, 16).round().astype(int))
+    waves = np.asarray(film.wavelengths)[columns]
+    weights = albedo_basis(waves)[:, :, None] * np.eye(len(columns))[:, None, :]
+    return waves, weights, columns
+
+
+def _variants(unknowns: Unknowns, waves: np.ndarray) -> list[np.ndarray]:
+    """Coordinates of the start, and of the start with another index and another dispersion."""
+    start = unknowns.coefficients
+    middle = np.array([np.sqrt(waves.min() * waves.max())])
+    ultraviolet = start.C < start.low**2
+    found = [start.start()]
+    for factor in (0.3, 0.6, 1.0, 1.5, 2.0, 2.6, 3.3):
+        # A resonance stays below the band, as the coordinates demand.
+        C = np.where(ultraviolet, np.minimum(start.C * factor, 0.9 * start.low**2), start.C)
+        moved = Coefficients(start.B, C, start.low, start.high, start.free)
+        excess = float(moved.index(moved.start(), middle)[0]) ** 2 - 1
+        for n in np.arange(1.25, 2.6, 0.0125):
+            scaled = np.where(np.array(start.free[:3]), start.B * (n**2 - 1) / excess, start.B)
+            shifted = Coefficients(scaled, C, start.low, start.high, start.free)
+            found.append(shifted.start())
+    return found
+
+
+def _fit(
+    problem: Problem, target: Picture, prior: str, noise: float | None
+) -> FitResult:
+    """Coarse to fine: the best of several starts, then the whole picture, then its final form."""
+    film, depth, seed = problem.film, target.depth or 50, target.seed or 0
+    coarse = max(1, -(-max(film.width, film.height) // COARSE_PIXELS))
+    level = _level(problem, coarse, 16, depth, seed)
+    ends = [_descend(problem, level, z, 1e-4, 6, 1.0) for z in _starts(problem, level, 3)]
+    best = min(ends, key=lambda end: end.lin.cost)
+    samples = target.samples or SAMPLES[0]
+    if coarse > 1 or samples != 16:
+        level = _level(problem, 1, samples, depth, seed)
+        best = _descend(problem, level, best.z, 1e-5, 20, 0.3 if target.samples is None else SMALL_STEP)
+    if target.samples is None:
+        level = _refined(problem, level, best.z, SAMPLES[1])
+        best = _descend(problem, level, best.z, 1e-5, 30, SMALL_STEP)
+    if 1e-7 * np.sqrt(best.lin.seen) > SMALL_STEP * best.lin.noise:
+        # A picture so clean shows the light of the paths that were ended early: about a hundredth
+        # of what they had left.
+        exact = _descend(problem, level, best.z, 0.0, 30, SMALL_STEP)
+        best = exact._replace(steps=best.steps + exact.steps)
+    return _result(problem, best, level, prior, noise)
+
+
+def _result(
+    problem: Problem, end: Descent, level: Level, prior: str, given: float | None
+) -> FitResult:
+    """The result in the words of the glass, with its errors."""
+    unknowns, lin, film = problem.unknowns, end.lin, problem.film
+    z = jnp.asarray(end.z)
+    meat, noise, source = _noise(lin, given, float(np.max(np.abs(problem.target))))
+    covariance = _log_covariance(unknowns, z, lin, meat, noise)
+    to_logs = jax.jacfwd(unknowns.coefficients.logarithms)(z)
+
+    def with_error(f: Callable[[jax.Array], jax.Array]) -> tuple[np.ndarray, np.ndarray]:
+        slope = np.asarray(jax.jacfwd(f)(z)) / np.diag(to_logs)
+        return np.asarray(f(z)), np.sqrt(np.sum((slope @ covariance) * slope, axis=-1))
+
+    waves = COLOR_WAVELENGTHS if film.wavelengths is None else np.asarray(film.wavelengths)
+    n, n_std = with_error(lambda z: unknowns.coefficients.index(z, waves))
+    lines, lines_std = with_error(lambda z: _line_figures(unknowns.coefficients, z))
+    B, C = (np.asarray(v) for v in unknowns.coefficients.values(z))
+    full = _coefficient_covariance(unknowns.coefficients, B, C, covariance)
+    B, C, full = _in_order(unknowns.coefficients, B, C, full)
+    std = np.sqrt(np.diag(full))
+    singular = 1 / np.sqrt(np.linalg.eigvalsh(covariance))
+    singular = np.sort(singular)[::-1]
+    determined = int(np.sum(singular > 1 / DETERMINED))
+    glass = Sellmeier(B, C, object_glass(problem.scene, problem.number).validity)
+    converged, message = _verdict(end)
+    ranked = _nearest(unknowns, end.z, lin, meat)
+    return FitResult(
+        scene=with_glass(problem.scene, problem.number, glass),
+        glass=glass,
+        object_name=problem.scene.objects[problem.number].name,
+        converged=converged,
+        message=message,
+        steps=end.steps,
+        B=B,
+        C=C,
+        B_std=std[:3],
+        C_std=std[3:],
+        covariance=full,
+        n_d=float(lines[0]),
+        n_d_std=float(lines_std[0]),
+        V_d=float(lines[1]),
+        V_d_std=float(lines_std[1]),
+        P_gF=float(lines[2]),
+        P_gF_std=float(lines_std[2]),
+        wavelengths=waves,
+        n=n,
+        n_std=n_std,
+        singular_values=singular,
+        determined=determined,
+        summary=_summary(waves, n_std, determined, len(singular), source, prior),
+        rms_residual=lin.rms,
+        nearest_glasses=ranked,
+        prior=prior,
+        noise=given,
+        samples=tuple(part.plan.samples for part in level.parts),
+        picture=lin.picture.reshape(problem.target.shape),
+    )
+
+
+def _noise(lin: Linearised, given: float | None, brightest: float) -> tuple[np.ndarray, float, str]:
+    """How noise enters q (m, m), its standard deviation, and where both come from, in words."""
+    if given is not None and lin.noise <= 1.1 * given:
+        return given**2 * np.eye(len(lin.q)), given, f"at the given noise of {given:g}"
+    if given is None and lin.noise < CLEAN * brightest:
+        return (
+            ASSUMED_NOISE**2 * np.eye(len(lin.q)),
+            ASSUMED_NOISE,
+            f"the picture is clean; at an assumed noise of {ASSUMED_NOISE:g}",
+        )
+    source = f"at the noise of {lin.noise:.2g} estimated from the residual"
+    if given is not None:
+        source += f", more than the given {given:g}"
+    return lin.meat, lin.noise, source
+
+
+def _log_covariance(
+    unknowns: Unknowns, z: jax.Array, lin: Linearised, meat: np.ndarray, noise: float
+) -> np.ndarray:
+    """Covariance (free, free) of log |B| and log C.
+
+    Source:
+        White, Econometrica 48 (1980) 817: the covariance that holds where the noise is not the
+        same everywhere, from the residuals themselves; by singular values, so that nothing
+        nearly singular is squared.
+    """
+    index = unknowns.coefficients.index(z, unknowns.reference)
+    to_logs = jnp.diag(jax.jacfwd(unknowns.coefficients.logarithms)(z))
+    slope = np.asarray(jax.jacfwd(lambda z: unknowns.change(z, index))(z) / to_logs[None, :])
+    rows = np.concatenate([lin.r @ slope / noise, unknowns.prior_rows], axis=0)
+    left, scales, right = np.linalg.svd(rows, full_matrices=True)
+    count, m = len(scales), len(meat)
+    within = np.eye(len(rows))
+    within[:m, :m] = meat / noise**2
+    core = left[:, :count].T @ within @ left[:, :count]
+    gain = scales / (scales**2 + WIDEST**-2)
+    known = gain[:, None] * core * gain[None, :]
+    # A direction that nothing is known of keeps the widest error that still means anything.
+    rest = np.full(len(z), WIDEST**2)
+    rest[:count] = (1 / (1 + (scales * WIDEST) ** 2)) * WIDEST**2 / (1 + (scales * WIDEST) ** 2)
+    total = np.diag(rest)
+    total[:count, :count] += known
+    return right.T @ total @ right
+
+
+def _line_figures(coefficients: Coefficients, z: jax.Array) -> jax.Array:
+    """n_d, V_d and P_gF (3,)."""
+    d, F, C, g = coefficients.index(z, np.array([LINE_D, LINE_F, LINE_C, LINE_G]))
+    return jnp.stack([d, (d - 1) / (F - C), (g - F) / (F - C)])
+
+
+def _coefficient_covariance(
+    coefficients: Coefficients, B: np.ndarray, C: np.ndarray, covariance: np.ndarray
+) -> np.ndarray:
+    """Covariance (6, 6) of B and C from that of the logarithms of the free ones."""
+    free = np.flatnonzero(coefficients.free)
+    scale = np.concatenate([B, C])[free]
+    full = np.zeros((6, 6))
+    full[np.ix_(free, free)] = scale[:, None] * covariance * scale[None, :]
+    return full
+
+
+def _in_order(
+    coefficients: Coefficients, B: np.ndarray, C: np.ndarray, covariance: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Terms by rising C, as catalogues print them, where the start had them so."""
+    order = _by_C(C)
+    if np.any(np.diff(coefficients.C) < 0):
+        order = np.arange(6)
+    return B[order[:3]], C[order[:3]], covariance[np.ix_(order, order)]
+
+
+def _verdict(end: Descent) -> tuple[bool, str]:
+    """Whether a fit may be called converged, and why."""
+    if end.lin.seen == 0:
+        return False, "no pixel of the picture depends on this glass"
+    if not end.converged:
+        return False, f"no minimum was reached in {end.steps} steps"
+    if end.lin.explained <= 0:
+        return False, "the best glass does not explain the picture: is it one of this scene?"
+    return True, f"a minimum was reached in {end.steps} steps"
+
+
+def _nearest(
+    unknowns: Unknowns, z: np.ndarray, lin: Linearised, meat: np.ndarray
+) -> tuple[tuple[str, float], ...]:
+    """The five nearest glasses of the table, in standard deviations of what the picture tells."""
+    fitted = np.asarray(unknowns.coefficients.index(z, unknowns.reference))
+    low, high = float(unknowns.coefficients.low), float(unknowns.coefficients.high)
+    spread = np.linalg.pinv(meat, hermitian=True)
+    found = []
+    for name, glass in glass_table().items():
+        if domain_error(glass, low, high):
+            continue
+        off = lin.r @ unknowns.project @ (np.asarray(glass.indices(unknowns.reference)) - fitted)
+        found.append((name, float(np.sqrt(max(off @ spread @ off, 0.0)))))
+    return tuple(sorted(found, key=lambda entry: entry[1])[:5])
+
+
+def _summary(
+    waves: np.ndarray, n_std: np.ndarray, determined: int, free: int, source: str, prior: str
+) -> str:
+    """What the picture determines, in plain words."""
+    known = f"{determined} of the {free} directions of (B, C)"
+    text = (
+        f"This picture fixes n to {np.max(n_std):.1e} (1 sigma) between {waves.min() * 1e3:.0f}"
+        f" and {waves.max() * 1e3:.0f} nm and {known} to better than 10 %"
+        f" ({source}{'' if prior == 'none' else f', with the prior {prior}'})."
+    )
+    if determined < free:
+        text += (
+            " B and C are not determined one by one: over these wavelengths other values of them"
+            " give the same n(λ) within its error."
+        )
+    return text

@@ -1,0 +1,430 @@
+"""What a fit found: as JSON, as a table, as a page of plots; and a plot of one glass."""
+
+import contextlib
+import json
+import math
+import os
+import secrets
+import textwrap
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from diffdisp.color import encode_srgb
+from diffdisp.dispersion import Sellmeier
+from diffdisp.fitting import FitResult
+from diffdisp.glasses import named_glass
+from diffdisp.image import Picture, linear_rgb
+
+UNDETERMINED = 0.1
+"""Relative standard error of a coefficient from which on the picture does not determine it."""
+
+PLOT_LIMITS = (0.1, 50.0)
+"""Wavelengths that a plot of a glass shows at most, µm."""
+UNSTATED_RANGE = (0.3, 2.5)
+"""Ends of a plot where a glass states none, µm: the range of optical glass catalogues."""
+HIGHEST_INDEX = 5.0
+"""Indices above are next to a pole, and left out of a plot: no transparent solid has more."""
+
+
+# The fit as JSON.
+
+
+def fit_json(result: FitResult) -> dict[str, Any]:
+    """The result as the content of `fit.json`.
+
+    Args:
+        result: of `fit`.
+
+    Returns:
+        Plain numbers, texts and lists; null in the place of NaN and infinity, which JSON has not.
+    """
+    return {
+        "object": result.object_name,
+        "prior": result.prior,
+        "converged": bool(result.converged),
+        "message": result.message,
+        "steps": int(result.steps),
+        "B": _plain(result.B),
+        "C": _plain(result.C),
+        "B_std": _plain(result.B_std),
+        "C_std": _plain(result.C_std),
+        "covariance": _plain(result.covariance),
+        "n_d": _plain(result.n_d),
+        "n_d_std": _plain(result.n_d_std),
+        "V_d": _plain(result.V_d),
+        "V_d_std": _plain(result.V_d_std),
+        "P_gF": _plain(result.P_gF),
+        "P_gF_std": _plain(result.P_gF_std),
+        "wavelength": _plain(result.wavelengths),
+        "n": _plain(result.n),
+        "n_std": _plain(result.n_std),
+        "singular_values": _plain(result.singular_values),
+        "determined": int(result.determined),
+        "summary": result.summary,
+        "rms_residual": _plain(result.rms_residual),
+        "nearest_glasses": [
+            {"name": name, "distance": _plain(distance)}
+            for name, distance in result.nearest_glasses
+        ],
+    }
+
+
+def write_fit_json(path: str | os.PathLike[str], result: FitResult) -> None:
+    """Write `fit_json(result)`: beside, then renamed, so that an older file stays whole."""
+    text = json.dumps(fit_json(result), indent=2, ensure_ascii=False, allow_nan=False)
+    with _replacing(path) as beside:
+        beside.write_text(text + "\n", encoding="utf-8")
+
+
+def _plain(values: Any) -> Any:
+    """Numbers and nested lists of them; None for what is not finite."""
+    if isinstance(values, list):
+        return [_plain(value) for value in values]
+    if isinstance(values, float | int):
+        return values if math.isfinite(values) else None
+    return _plain(np.asarray(values).tolist())
+
+
+# The fit as a table.
+
+
+def result_table(result: FitResult) -> str:
+    """The result as a short table, ending in the summary.
+
+    Args:
+        result: of `fit`.
+
+    Returns:
+        Lines without a newline after the last one; errors are 1 sigma.
+    """
+    rows = [
+        ("object", result.object_name or "(unnamed)"),
+        ("converged", f"{'yes' if result.converged else 'NO'}, {_steps(result.steps)}"),
+        *([] if result.converged else [("message", result.message)]),
+        ("prior", result.prior),
+        ("n_d", _with_error(result.n_d, result.n_d_std)),
+        ("V_d", _with_error(result.V_d, result.V_d_std)),
+        ("P_gF", _with_error(result.P_gF, result.P_gF_std)),
+        *_coefficient_rows(result),
+        ("determined", f"{result.determined} of {len(result.singular_values)} directions"),
+        ("nearest", _nearest(result)),
+        ("residual", f"{result.rms_residual:.3g} rms"),
+    ]
+    table = "\n".join(f"{name:<11}{text}" for name, text in rows)
+    return f"{table}\n\n{textwrap.fill(result.summary, 79)}"
+
+
+def _steps(count: int) -> str:
+    return f"{count} step" if count == 1 else f"{count} steps"
+
+
+def _coefficient_rows(result: FitResult) -> Iterator[tuple[str, str]]:
+    """A line for each of B and C."""
+    for name, unit, values, errors in (
+        ("B", "", result.B, result.B_std),
+        ("C", " µm²", result.C, result.C_std),
+    ):
+        for i, (value, error) in enumerate(zip(values, errors, strict=True), 1):
+            yield f"{name}{i}{unit}", _coefficient(float(value), float(error))
+
+
+def _coefficient(value: float, error: float) -> str:
+    """A coefficient with its error, or why it has none."""
+    if error == 0:
+        return f"{value:.7g}   held fixed"
+    determined = error < UNDETERMINED * abs(value)
+    return f"{_with_error(value, error)}{'' if determined else '   undetermined'}"
+
+
+def _with_error(value: float, error: float) -> str:
+    """The value down to the second digit of its error."""
+    if not math.isfinite(value):
+        return "not defined"
+    if not math.isfinite(error) or error <= 0:
+        return f"{value:.7g} ± {'unknown' if error else '0'}"
+    decimals = min(max(1 - math.floor(math.log10(error)), 0), 12)
+    return f"{value:.{decimals}f} ± {error:.{decimals}f}"
+
+
+def _nearest(result: FitResult) -> str:
+    """The catalogue glasses next to the result, with their distances."""
+    return ", ".join(
+        f"{name} {distance:.{0 if distance >= 100 else 2}f} σ"
+        for name, distance in result.nearest_glasses[:3]
+    )
+
+
+# The fit as a page of plots.
+
+
+def write_report(path: str | os.PathLike[str], result: FitResult, target: Picture) -> None:
+    """Draw what a fit found: target, fit, residual, n(λ), its error, and the table.
+
+    The file is written beside and renamed.
+
+    Args:
+        path: where to; the suffix says the format: .png, .pdf or .svg.
+        result: of `fit`.
+        target: what was fitted.
+
+    Raises:
+        ValueError: a suffix that cannot be drawn, or a folder that does not exist.
+    """
+    check_plot_output(path)
+    figure = Figure(figsize=(13.5, 8.2), layout="constrained")
+    grid = figure.add_gridspec(2, 3, height_ratios=(1, 1.05), width_ratios=(1, 1, 1.15))
+    _draw_pictures([figure.add_subplot(grid[0, i]) for i in range(3)], result, target)
+    _draw_index(figure.add_subplot(grid[1, 0]), result)
+    _draw_difference(figure.add_subplot(grid[1, 1]), result)
+    _draw_text(figure.add_subplot(grid[1, 2]), result)
+    _save(figure, path)
+
+
+def _draw_pictures(axes: list[Axes], result: FitResult, target: Picture) -> None:
+    """Target and fit with the same exposure, and what lies between."""
+    shown, seen_as = _displayed(target.radiance, target)
+    fitted, _ = _displayed(result.picture, target)
+    for axis, picture, title in zip(axes, (shown, fitted), ("target", "fit"), strict=False):
+        axis.imshow(picture, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+        axis.set_title(f"{title} ({seen_as})")
+    residual = np.mean(np.asarray(result.picture, np.float64) - target.radiance, axis=-1)
+    limit = float(np.percentile(np.abs(residual), 99.5)) or float(np.abs(residual).max()) or 1.0
+    drawn = axes[2].imshow(
+        residual, cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest"
+    )
+    axes[2].set_title("residual (fit − target)")
+    bar = axes[2].figure.colorbar(drawn, ax=axes[2], extend="both", shrink=0.9)
+    bar.set_label(f"radiance, mean over {_channels(target)}")
+    bar.formatter.set_powerlimits((-2, 3))  # type: ignore[attr-defined]
+    for axis in axes:
+        axis.set_xlabel("x (pixels)")
+        axis.set_ylabel("y (pixels)")
+
+
+def _channels(target: Picture) -> str:
+    if target.wavelengths is None:
+        return "red, green, blue"
+    count = len(target.wavelengths)
+    return "1 band" if count == 1 else f"{count} bands"
+
+
+def _displayed(
+    radiance: Float[np.ndarray, "height width channels"], target: Picture
+) -> tuple[Float[np.ndarray, "height width *rgb"], str]:
+    """What the eye would see of `radiance`, exposed for `target`, and what that is called."""
+    try:
+        light = linear_rgb(Picture(radiance, target.wavelengths))
+        exposed_for, seen_as = linear_rgb(target), "as the eye sees it"
+    except ValueError:  # bands that have no colour
+        assert target.wavelengths is not None
+        middle = len(target.wavelengths) // 2
+        light, exposed_for = radiance[..., middle], target.radiance[..., middle]
+        seen_as = f"{target.wavelengths[middle] * 1e3:.4g} nm"
+    # A few glints may saturate; the picture behind them should not be dark.
+    white = float(np.percentile(exposed_for, 99))
+    return encode_srgb(np.asarray(light, np.float64) / (white if white > 0 else 1.0)), seen_as
+
+
+def _draw_index(axis: Axes, result: FitResult) -> None:
+    """n(λ) of the fit with its band, among the nearest catalogue glasses."""
+    wavelengths, n, error = _sorted_index(result)
+    axis.plot(wavelengths, n, "o-", color="C0", markersize=3, zorder=3, label="fit")
+    _band(axis, wavelengths, n - error, n + error)
+    margin = 0.3 * float(np.ptp(n)) or 1e-4
+    axis.set_ylim(float(n.min()) - margin, float(n.max()) + margin)
+    for i, (name, difference) in enumerate(_nearest_differences(result, wavelengths, n), 1):
+        _glass_curve(axis, wavelengths, n + difference, name, i)
+    axis.set_title("refractive index")
+    axis.set_xlabel("wavelength λ (µm)")
+    axis.set_ylabel("n")
+    axis.ticklabel_format(axis="y", useOffset=False)
+    axis.grid(alpha=0.3)
+    axis.legend(fontsize="small")
+
+
+def _draw_difference(axis: Axes, result: FitResult) -> None:
+    """The band enlarged, and the catalogue glasses that lie beside it."""
+    wavelengths, n, error = _sorted_index(result)
+    _band(axis, wavelengths, -error * 1e5, error * 1e5)
+    axis.axhline(0, color="C0", linewidth=1.5, label="fit")
+    glasses = _nearest_differences(result, wavelengths, n)
+    limit = 1e5 * _limit(error, [difference for _, difference in glasses])
+    axis.set_ylim(-limit, limit)
+    for i, (name, difference) in enumerate(glasses, 1):
+        _glass_curve(axis, wavelengths, 1e5 * difference, name, i)
+    axis.set_title("difference from the fit")
+    axis.set_xlabel("wavelength λ (µm)")
+    axis.set_ylabel("n − n_fit (1e-5)")
+    axis.grid(alpha=0.3)
+    axis.legend(fontsize="small")
+
+
+def _nearest_differences(
+    result: FitResult, wavelengths: Float[np.ndarray, " k"], n: Float[np.ndarray, " k"]
+) -> list[tuple[str, Float[np.ndarray, " k"]]]:
+    """The nearest catalogue glasses and how far their index lies from `n`."""
+    names = [name for name, _ in result.nearest_glasses[:3]]
+    return [(name, _indices(named_glass(name), wavelengths) - n) for name in names]
+
+
+def _glass_curve(
+    axis: Axes,
+    wavelengths: Float[np.ndarray, " k"],
+    values: Float[np.ndarray, " k"],
+    name: str,
+    number: int,
+) -> None:
+    """A catalogue glass; where the limits leave it out, the legend says so."""
+    low, high = axis.get_ylim()
+    inside = np.any((values >= low) & (values <= high))
+    label = name if inside else f"{name} (outside)"
+    axis.plot(wavelengths, values, ".--", color=f"C{number}", markersize=3, lw=1, label=label)
+
+
+def _limit(error: Float[np.ndarray, " k"], glasses: list[Float[np.ndarray, " k"]]) -> float:
+    """Half the height that shows the band and, unless that flattens the band, the nearest glass."""
+    band = 3 * float(np.max(error, initial=0.0, where=np.isfinite(error)))
+    glass = 1.2 * float(np.nanmax(np.abs(glasses[0]), initial=0.0)) if glasses else 0.0
+    return (max(band, glass) if glass <= 10 * band or not band else band) or 1e-5
+
+
+def _sorted_index(result: FitResult) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Wavelengths in rising order, with n and its error."""
+    order = np.argsort(result.wavelengths)
+    return result.wavelengths[order], result.n[order], result.n_std[order]
+
+
+def _band(
+    axis: Axes,
+    wavelengths: Float[np.ndarray, " k"],
+    low: Float[np.ndarray, " k"],
+    high: Float[np.ndarray, " k"],
+) -> None:
+    """±1 sigma: an area, or a bar where a single wavelength spans none."""
+    known = np.isfinite(low) & np.isfinite(high)
+    if len(wavelengths) == 1 and known.all():
+        middle = (low + high) / 2
+        axis.errorbar(wavelengths, middle, (high - low) / 2, color="C0", capsize=4, label="±1σ")
+    elif known.any():
+        axis.fill_between(
+            wavelengths, low, high, where=known, color="C0", alpha=0.25, linewidth=0, label="±1σ"
+        )
+
+
+def _draw_text(axis: Axes, result: FitResult) -> None:
+    """The table of the result, as printed."""
+    axis.axis("off")
+    table, _, summary = result_table(result).partition("\n\n")
+    lines = [part for line in table.split("\n") for part in textwrap.wrap(line, 50, **_HANGING)]
+    lines += ["", *textwrap.wrap(" ".join(summary.split()), 52)]
+    axis.text(
+        0,
+        1,
+        "\n".join(lines).replace("$", r"\$"),
+        transform=axis.transAxes,
+        va="top",
+        family="monospace",
+        fontsize=8.5,
+        linespacing=1.25,
+    )
+
+
+_HANGING: dict[str, Any] = {
+    "subsequent_indent": " " * 11,
+    "drop_whitespace": True,
+    "replace_whitespace": False,
+}
+"""How a line of the table is broken: what follows stands under the second column."""
+
+
+# One glass.
+
+
+def write_glass_plot(path: str | os.PathLike[str], glass: Sellmeier) -> None:
+    """Draw n(λ) of a glass over its range of validity.
+
+    The file is written beside and renamed.
+
+    Args:
+        path: where to; the suffix says the format: .png, .pdf or .svg.
+        glass: what to draw. Where it states no range, that of optical catalogues is shown.
+
+    Raises:
+        ValueError: a suffix that cannot be drawn, or a folder that does not exist.
+    """
+    check_plot_output(path)
+    low, high = _plot_range(glass)
+    wavelengths = np.geomspace(low, high, 1001)
+    n = _indices(glass, wavelengths)
+    figure = Figure(figsize=(7, 4.5), layout="constrained")
+    axis = figure.add_subplot()
+    axis.plot(wavelengths, np.where(n < HIGHEST_INDEX, n, np.nan), color="C0")
+    axis.set_title(f"{glass.name or 'glass'}, {low:.4g}–{high:.4g} µm".replace("$", r"\$"))
+    axis.set_xlabel("wavelength λ (µm)")
+    axis.set_ylabel("refractive index n")
+    axis.ticklabel_format(axis="y", useOffset=False)
+    axis.grid(alpha=0.3)
+    _save(figure, path)
+
+
+def _plot_range(glass: Sellmeier) -> tuple[float, float]:
+    """The range of validity, where it is one that can be drawn."""
+    low, high = (float(edge) for edge in np.asarray(glass.validity))
+    low = max(low, PLOT_LIMITS[0]) if low > 0 else min(UNSTATED_RANGE[0], high / 10)
+    high = min(high, PLOT_LIMITS[1]) if high < np.inf else max(UNSTATED_RANGE[1], 10 * low)
+    # A range that lies beyond the limits altogether is shown from its beginning.
+    return (low, high) if low < high else (low, 10 * low)
+
+
+def _indices(glass: Sellmeier, wavelengths: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+    """The index in double precision, whatever the state of JAX's switch; NaN where none is."""
+    with jax.enable_x64(True):
+        return np.asarray(glass.indices(wavelengths))
+
+
+# Files.
+
+
+def check_plot_output(path: str | os.PathLike[str]) -> None:
+    """Raise now what writing a plot would raise later.
+
+    Args:
+        path: where the plot will go.
+
+    Raises:
+        ValueError: a suffix that cannot be drawn; a folder that does not exist.
+    """
+    suffix, folder = Path(path).suffix.lower(), Path(path).parent
+    if suffix not in (".png", ".pdf", ".svg"):
+        raise ValueError(f"{path}: a plot ends in one of .png, .pdf, .svg; found {suffix!r}")
+    if not folder.is_dir():
+        raise ValueError(f"{path}: there is no folder {folder}")
+    if Path(path).is_dir():
+        raise ValueError(f"{path}: is a folder")
+
+
+def _save(figure: Figure, path: str | os.PathLike[str]) -> None:
+    """Write a figure beside `path` and rename it."""
+    FigureCanvasAgg(figure)
+    with _replacing(path) as beside:
+        figure.savefig(beside, dpi=120)
+
+
+@contextlib.contextmanager
+def _replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """A name beside `path` to write to, which takes its place once all is written."""
+    target = Path(os.path.realpath(path))  # through a link: the file it points to is replaced
+    beside = target.parent / f".{secrets.token_hex(8)}{target.suffix.lower()}"
+    try:
+        yield beside
+        beside.replace(target)
+    finally:
+        beside.unlink(missing_ok=True)

@@ -1,0 +1,177 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import numbers
+
+from diffdisp.geometry import Ray, plane_axes, plane_distance, sphere_distances
+from diffdisp.vector import Vec3, vec3
+
+RNG = np.random.default_rng(1)
+BESIDE = Vec3(*jnp.array([0.0, 0.0, -5.0]))
+
+
+def ray(origin, direction):
+    """A ray of arrays, whose direction is made a unit vector."""
+    direction = np.asarray(direction, float)
+    return Ray(vec3(jnp.asarray(origin, float)), vec3(jnp.asarray(unit(direction))))
+
+
+def unit(v):
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def meet(origins, directions, center, radius):
+    """`sphere_distances` of many rays (N, 3), in the dtype of the arrays."""
+    rays = Ray(Vec3(*jnp.asarray(origins).T), Vec3(*jnp.asarray(directions).T))
+    one = jax.vmap(lambda r: sphere_distances(r, vec3(jnp.asarray(center)), jnp.asarray(radius)))
+    return [np.asarray(part) for part in jax.jit(one)(rays)]
+
+
+def truth(origins, directions, center, radius):
+    """Roots of |o + t d - c|² = r² by `np.roots`' textbook form, in float64."""
+    origins, directions, center = (np.asarray(v, np.float64) for v in (origins, directions, center))
+    o = origins - center
+    a, b = (directions**2).sum(-1), (o * directions).sum(-1)
+    # Lagrange's identity: a·|o|² - (o·d)² = |o × d|², without cancellation.
+    discriminant = a * np.float64(radius) ** 2 - (np.cross(o, directions) ** 2).sum(-1)
+    root = np.sqrt(np.maximum(discriminant, 0))
+    return (-b - root) / a, (-b + root) / a, discriminant > 0
+
+
+@pytest.mark.parametrize("radius", [1e-3, 1.0, 100.0])
+@pytest.mark.parametrize("scale", [0.3, 2.0, 30.0], ids=["inside", "near", "far"])
+def test_distances_are_the_roots_of_the_quadratic(radius, scale):
+    center = RNG.normal(size=3)
+    origins = center + radius * scale * unit(RNG.normal(size=(500, 3)))
+    targets = center + radius * RNG.uniform(-1.2, 1.2, size=(500, 3))
+    directions = unit(targets - origins)
+    near, far, hit = meet(origins, directions, center, radius)
+    t1, t2, expected = truth(origins, directions, center, radius)
+    np.testing.assert_array_equal(hit, expected)
+    # Rounding at the distance `scale`, over the root's slope at the most grazing of 500 rays.
+    tolerance = 1e-13 * radius * (1 + scale) ** 2
+    np.testing.assert_allclose(near[hit], t1[hit], rtol=0, atol=tolerance)
+    np.testing.assert_allclose(far[hit], t2[hit], rtol=0, atol=tolerance)
+
+
+def test_a_far_small_ball_keeps_its_outline_in_float32():
+    # The unit ball at distance 1e4; a quadratic in float32 misjudges a fifth of these rays.
+    distance = np.float32(1e4)
+    impact, turn = RNG.uniform(0, 2, 2000), RNG.uniform(0, 2 * np.pi, 2000)
+    targets = np.stack([impact * np.cos(turn), impact * np.sin(turn), 0 * impact], -1)
+    origins = np.zeros((2000, 3), np.float32) + np.float32([0, 0, distance])
+    directions = unit(targets - origins).astype(np.float32)
+    with jax.enable_x64(False):
+        near, far, hit = meet(origins, directions, np.zeros(3, np.float32), np.float32(1))
+    t1, t2, expected = truth(origins, unit(directions.astype(float)), np.zeros(3), 1.0)
+    # A direction's rounding moves the ray by 6e-8 · 1e4, its foot as much again: the rim.
+    clear = np.abs(impact - 1) > 2e-3
+    np.testing.assert_array_equal(hit[clear], expected[clear])
+    sure = clear & expected
+    # Half a unit in the last place of 1e4 for the result and each of two operations before it,
+    # and what the foot's error does to the root at the rim, 0.0013 · 1 / √(1 - 0.998²).
+    np.testing.assert_allclose(near[sure], t1[sure], rtol=0, atol=0.03)
+    np.testing.assert_allclose(far[sure], t2[sure], rtol=0, atol=0.03)
+
+
+@pytest.mark.parametrize(
+    ("origin", "direction", "near", "far"),
+    [
+        ((0, 0, 3), (0, 0, -1), 2, 4),
+        ((0, 0, 3), (0, 0, 1), -4, -2),
+        ((0, 0, 0), (0, 1, 0), -1, 1),
+        ((0, 0, 1), (0, 0, 1), -2, 0),
+        ((0, 0, 1), (0, 0, -1), 0, 2),
+        ((0, 0, 1), (0.6, 0, -0.8), 0, 1.6),
+    ],
+)
+def test_distances_from_before_behind_within_and_on_the_sphere(origin, direction, near, far):
+    found = sphere_distances(ray(origin, direction), vec3(jnp.zeros(3)), jnp.array(1.0))
+    np.testing.assert_allclose(found[:2], (near, far), rtol=0, atol=1e-15)
+    assert found[2]
+
+
+def ends(x, z=3.0, radius=1.0):
+    """Both distances for a ray along -z beside the axis."""
+    start = Ray(Vec3(x, jnp.zeros(()), jnp.asarray(z)), vec3(jnp.array([0, 0, -1.0])))
+    return jnp.stack(sphere_distances(start, vec3(jnp.zeros(3)), jnp.asarray(radius))[:2])
+
+
+FORWARD = jax.jit(jax.jacfwd(ends, argnums=(0, 1, 2)))
+REVERSE = jax.jit(jax.jacrev(ends, argnums=(0, 1, 2)))
+SECOND = jax.jit(jax.jacfwd(jax.jacrev(ends)))
+
+
+@pytest.mark.parametrize("x", [0.0, 0.5, np.nextafter(1, 0), 1.0, np.nextafter(1, 2), 2.0])
+@pytest.mark.parametrize("z", [3.0, 0.0, -3.0])
+@pytest.mark.parametrize("mode", [FORWARD, REVERSE, SECOND])
+def test_gradients_are_finite_at_the_rim_and_beyond(x, z, mode):
+    slopes = mode(jnp.array(x), jnp.array(z), jnp.array(1.0))
+    assert all(np.isfinite(slope).all() for slope in jax.tree.leaves(slopes))
+
+
+@pytest.mark.parametrize("x", [0.0, 0.6, 0.8])
+def test_gradients_by_hand(x):
+    by_x, _, by_radius = FORWARD(jnp.array(x), jnp.array(3.0), jnp.array(1.0))
+    root = np.sqrt(1 - x * x)
+    np.testing.assert_allclose(
+        by_x, [x / root, -x / root], rtol=0, atol=1e-14
+    )  # some ten roundings
+    np.testing.assert_allclose(by_radius, [-1 / root, 1 / root], rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("origin", "direction", "normal", "distance"),
+    [
+        ((0, 0, 0), (0, 0, -1), (0, 0, 1), 5),
+        ((0, 0, 0), (0, 0, -1), (0, 0, -7), 5),
+        ((0, 0, -9), (0, 0, 1), (0, 0, 1), 4),
+        ((0, 0, 0), (0, 0, 1), (0, 0, 1), -5),
+        ((0, 0, 0), (0.6, 0, -0.8), (0, 0, 1), 6.25),
+        ((0, 0, 0), (1, 0, 0), (0, 0, 1), -1),
+        ((0, 0, -5), (1, 0, 0), (0, 0, 1), -1),
+    ],
+)
+def test_distance_to_a_plane(origin, direction, normal, distance):
+    found = plane_distance(ray(origin, direction), BESIDE, vec3(jnp.asarray(normal, float)))
+    np.testing.assert_allclose(found, distance, rtol=1e-15)
+
+
+def test_gradient_is_finite_along_a_plane():
+    def distance(direction):
+        start = Ray(vec3(jnp.zeros(3)), vec3(direction))
+        return plane_distance(start, BESIDE, vec3(jnp.array([0, 0, 1.0])))
+
+    assert np.isfinite(jax.grad(distance)(jnp.array([1.0, 0, 0]))).all()
+
+
+@pytest.mark.parametrize(
+    ("normal", "u", "v"),
+    [
+        ((0, 0, 1), (1, 0, 0), (0, 1, 0)),
+        ((0, 0, -2), (-1, 0, 0), (0, 1, 0)),
+        ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
+        ((0, 1, 0), (1, 0, 0), (0, 0, -1)),
+        ((0, -3, 0), (1, 0, 0), (0, 0, 1)),
+    ],
+)
+def test_axes_of_the_main_planes(normal, u, v):
+    axes = plane_axes(vec3(jnp.asarray(normal, float)))
+    np.testing.assert_array_equal(numbers(axes[0]), u)
+    np.testing.assert_array_equal(numbers(axes[1]), v)
+
+
+@pytest.mark.parametrize("normal", [*RNG.normal(size=(4, 3)), np.array([1e-9, 1.0, 0.0])])
+def test_axes_as_defined(normal):
+    u, v = (numbers(axis) for axis in plane_axes(vec3(jnp.asarray(normal))))
+    # Unit vectors, rounded a few times.
+    np.testing.assert_allclose(u, unit(np.cross([0, 1, 0], normal)), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(v, np.cross(unit(normal), u), rtol=0, atol=1e-15)
+    np.testing.assert_allclose([np.linalg.norm(v), u @ v], [1, 0], rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("normal", [(0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.3, -0.5, 0.2)])
+def test_gradients_of_the_axes_are_finite(normal):
+    slopes = jax.jacrev(lambda n: plane_axes(vec3(n)))(jnp.array(normal))
+    assert all(np.isfinite(slope).all() for slope in jax.tree.leaves(slopes))

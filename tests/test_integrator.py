@@ -1,0 +1,260 @@
+import itertools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import AIR, N_D, ball, deviation, furnace, numbers, reflectance
+
+from diffdisp.dispersion import LINE_C, LINE_D, LINE_F
+from diffdisp.film import Film
+from diffdisp.fresnel import cos_transmitted, fresnel_reflectance
+from diffdisp.geometry import Ray
+from diffdisp.glasses import named_glass
+from diffdisp.integrator import Path, bounce, emission_table, once, world_tables
+from diffdisp.planning import Plan, make_plan
+from diffdisp.scene import Scene
+from diffdisp.vector import Vec3, vec3
+
+WATER = 1.33340
+FILM = Film(1, 1, wavelengths=[0.5875618])
+IMPACTS = (0.1, 0.5, 0.8, 0.95)
+TURN = (np.cos(0.4), np.sin(0.4))
+
+
+class Bench(NamedTuple):
+    """A scene as the tracer wants it."""
+
+    scene: Scene
+    plan: Plan
+
+    def bounce(self, path, n, chooses=0.0, inside=None):
+        """One bounce; every ball but the first has index 1."""
+        one = jnp.ones(())
+        indices = jnp.stack([jnp.asarray(n), *[one] * (self.plan.balls - 1)])
+        world, emission = world_tables(self.scene), emission_table(self.scene)
+        inside = path.last == path.ball if inside is None else inside
+        return bounce(
+            path=path,
+            branch=lambda bounces: jnp.asarray(chooses),
+            indices=indices,
+            world=world,
+            emission=emission,
+            plan=self.plan,
+            inside=inside,
+            cutoff=jnp.zeros(()),
+            one=None,
+        )
+
+
+def tracer_bench(*objects, depth=50):
+    scene = furnace(*objects)
+    plan = make_plan(scene, FILM, 1, depth, "float64")
+    return Bench(jax.tree.map(jnp.asarray, scene), plan)
+
+
+ALONE = tracer_bench(ball(N_D))
+SURROUNDED = tracer_bench(ball(N_D), ball(AIR, radius=50.0))
+"""What leaves the unit ball always meets the second: so its ray is kept."""
+
+
+def path_at(impact):
+    """A path that will meet the unit ball `impact` beside its centre, in a slanting plane."""
+    still = Vec3(*[jnp.zeros(())] * 3)
+    impact = jnp.asarray(impact)
+    origin = Vec3(impact * TURN[0], impact * TURN[1], jnp.array(4.0))
+    return Path(
+        ray=Ray(origin, vec3(jnp.array([0, 0, -1.0]))),
+        footprint=(Ray(still, still), Ray(still, still)),
+        ball=jnp.array(0, jnp.int32),
+        last=jnp.array(-1, jnp.int32),
+        throughput=jnp.ones(()),
+        radiance=jnp.zeros(3),
+        bounces=jnp.array(0, jnp.int32),
+        alive=jnp.array(True),
+    )
+
+
+@jax.jit
+def leave(impact, n, order):
+    """The ray of `order` that leaves the unit ball; order -1 is the outer reflection."""
+    inner = path_at(impact)
+    inner = jax.lax.fori_loop(0, order + 1, lambda _, p: SURROUNDED.bounce(p, n, 1 - 1e-12), inner)
+    outer = SURROUNDED.bounce(inner, n, 0.0)
+    return outer.ray, outer.ball
+
+
+@jax.jit
+def turned(impact, n, order):
+    """Angle by which the path has been turned towards the axis, modulo a whole turn."""
+    direction = leave(impact, n, order)[0].direction
+    return jnp.arctan2(-direction.x * TURN[0] - direction.y * TURN[1], -direction.z)
+
+
+SLOPES = jax.jit(jax.jacfwd(turned, argnums=(0, 1)))
+
+
+def same_angle(found, expected, tolerance):
+    apart = (found - expected + np.pi) % (2 * np.pi) - np.pi
+    np.testing.assert_allclose(apart, 0, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("impact", IMPACTS)
+@pytest.mark.parametrize("order", [-1, 0, 1, 2, 3])
+@pytest.mark.parametrize("n", [WATER, N_D, 2.4175])
+def test_deviation_of_an_order(impact, order, n):
+    expected = deviation(np.arcsin(impact), n, order)
+    # Some 1e-15 of rounding a surface, over cos r > 0.3.
+    same_angle(turned(jnp.array(impact), jnp.array(n), order), expected, 1e-12)
+
+
+@pytest.mark.parametrize("impact", IMPACTS)
+@pytest.mark.parametrize("order", [-1, 0, 1, 2, 3])
+def test_a_path_stays_in_its_plane_and_leaves_outwards(impact, order):
+    ray, _ = leave(jnp.array(impact), jnp.array(N_D), order)
+    origin, direction = numbers(ray.origin), numbers(ray.direction)
+    across = np.array([-TURN[1], TURN[0], 0.0])
+    # Rounding, as for all lengths below.
+    np.testing.assert_allclose([origin @ across, direction @ across], 0, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(np.linalg.norm(origin), 1, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(np.linalg.norm(direction), 1, rtol=0, atol=1e-13)
+    assert origin @ direction > 0
+
+
+@pytest.mark.parametrize("impact", IMPACTS)
+@pytest.mark.parametrize("order", [0, 1, 2, 3])
+def test_derivative_of_the_deviation_in_the_index(impact, order):
+    _, found = SLOPES(jnp.array(impact), jnp.array(N_D), order)
+    refraction = np.arcsin(impact / N_D)
+    expected = 2 * (order + 1) * np.tan(refraction) / N_D
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)  # rounding, as of the deviation
+
+
+@pytest.mark.parametrize(("order", "degrees"), [(1, 137.981), (2, 230.996)])
+def test_rainbows_of_water(order, degrees):
+    # Descartes' ray: cos² i = (n² - 1) / (p (p + 2)).
+    impact = float(np.sqrt(1 - (WATER**2 - 1) / (order * (order + 2))))
+    arguments = jnp.array(impact), jnp.array(WATER)
+    found = np.degrees(turned(*arguments, order)) % 360
+    # The printed digits of the angle, and of the index: 5e-6 of it make 0.7 and 1.3 thousandths.
+    np.testing.assert_allclose(found, degrees, rtol=0, atol=5.1e-4 + order * 7.3e-4)
+    slope, _ = SLOPES(*arguments, order)
+    np.testing.assert_allclose(slope, 0, rtol=0, atol=1e-12)  # least deviation, to rounding
+
+
+def test_focal_length_of_a_ball_and_its_chromatic_shift():
+    n_F, n_d, n_C = named_glass("N-BK7").indices(np.array([LINE_F, LINE_D, LINE_C]))
+    np.testing.assert_allclose(
+        paraxial_focus(n_d), 1.467492, rtol=0, atol=6e-7
+    )  # the printed digits
+    shift = paraxial_focus(n_F) - paraxial_focus(n_C)
+    np.testing.assert_allclose(shift, -0.014989, rtol=0, atol=6e-7)  # the printed digits
+
+
+def paraxial_focus(n):
+    """Distance from the centre to where a ray close to the axis crosses it."""
+    # Spherical aberration is of the order of impact² = 1e-8.
+    ray, _ = leave(jnp.array(1e-4), jnp.array(float(n)), 0)
+    beside = ray.origin.x * TURN[0] + ray.origin.y * TURN[1]
+    slope = ray.direction.x * TURN[0] + ray.direction.y * TURN[1]
+    return float(-(ray.origin.z - ray.direction.z * beside / slope))
+
+
+@pytest.mark.parametrize("impact", IMPACTS)
+@pytest.mark.parametrize("order", [-1, 0, 1, 2, 3])
+def test_angular_momentum_of_what_leaves(impact, order):
+    ray, caught = leave(jnp.array(impact), jnp.array(N_D), order)
+    assert caught == 1
+    momentum = np.linalg.norm(np.cross(numbers(ray.origin), numbers(ray.direction)))
+    np.testing.assert_allclose(momentum, impact, rtol=0, atol=1e-13)  # rounding
+
+
+@jax.jit
+def chords(impact, n):
+    """The path within the ball alone after each of five bounces."""
+    path = ALONE.bounce(path_at(impact), n, inside=False)
+    paths = [path]
+    for _ in range(4):
+        paths.append(ALONE.bounce(paths[-1], n, inside=True))
+    return paths
+
+
+@pytest.mark.parametrize("impact", IMPACTS)
+def test_chords_of_a_ball_alone(impact):
+    refraction = np.arcsin(impact / N_D)
+    paths = chords(jnp.array(impact), jnp.array(N_D))
+    for path in paths:
+        origin, direction = numbers(path.ray.origin), numbers(path.ray.direction)
+        momentum = N_D * np.linalg.norm(np.cross(origin, direction))
+        np.testing.assert_allclose(momentum, impact, rtol=0, atol=1e-13)  # rounding, as below
+        np.testing.assert_allclose(origin @ direction, -np.cos(refraction), rtol=0, atol=1e-13)
+    for here, there in itertools.pairwise(paths):
+        turn = numbers(here.ray.direction) @ numbers(there.ray.direction)
+        np.testing.assert_allclose(turn, -np.cos(2 * refraction), rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("impact", IMPACTS)
+def test_weights_of_the_orders(impact):
+    R = reflectance(np.arcsin(impact), N_D)
+    paths = chords(jnp.array(impact), jnp.array(N_D))
+    light = np.diff([0.0, *(path.radiance[0] for path in paths)])
+    # R outside, then (1 - R)² Rᵖ; what is left in the ball after them is (1 - R) Rᵖ.
+    powers = R ** np.arange(5)
+    np.testing.assert_allclose(
+        light, [R, *(1 - R) ** 2 * powers[:4]], rtol=0, atol=1e-12
+    )  # rounding
+    throughput = [path.throughput for path in paths]
+    np.testing.assert_allclose(throughput, (1 - R) * powers, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(light.sum() + throughput[-1], 1, rtol=0, atol=1e-12)
+    assert [int(path.bounces) for path in paths] == [1, 2, 3, 4, 5]
+
+
+def reflected(impact, n):
+    """Reflectance where a ray meets the unit ball."""
+    cos_i = jnp.sqrt(1 - impact**2)
+    return fresnel_reflectance(cos_i, cos_transmitted(cos_i, n), n)
+
+
+def collected(impact, n):
+    """Light after each of five bounces."""
+    return jnp.stack([path.radiance[0] for path in chords(impact, n)])
+
+
+COLLECTED_SLOPE = jax.jit(jax.jacfwd(collected, argnums=1))
+
+
+@pytest.mark.parametrize("impact", IMPACTS)
+def test_slope_of_the_weights_in_the_index(impact):
+    arguments = jnp.array(impact), jnp.array(N_D)
+    R, slope = float(reflected(*arguments)), float(jax.grad(reflected, argnums=1)(*arguments))
+    # The sum up to order p is 1 - (1 - R) Rᵖ⁺¹; the outer reflection stands first.
+    p = np.arange(5.0)
+    expected = slope * (R**p - (1 - R) * p * R ** np.maximum(p - 1, 0))
+    np.testing.assert_allclose(
+        COLLECTED_SLOPE(*arguments), expected, rtol=0, atol=1e-12
+    )  # rounding
+
+
+def test_the_last_order_ends_the_path():
+    shallow = tracer_bench(ball(N_D), depth=3)
+    entered = jax.jit(lambda path: shallow.bounce(path, N_D, inside=False))(path_at(0.5))
+    assert entered.alive
+    ended = jax.jit(lambda path: shallow.bounce(path, N_D, inside=True))(entered)
+    assert not ended.alive
+    np.testing.assert_array_equal(numbers(ended.ray.origin), numbers(entered.ray.origin))
+
+
+def test_a_path_that_has_ended_collects_nothing():
+    ended = path_at(jnp.array(0.5))._replace(alive=jnp.array(False))
+    after = jax.jit(lambda path: ALONE.bounce(path, N_D, inside=False))(ended)
+    jax.tree.map(np.testing.assert_array_equal, after, ended)
+
+
+def test_once_is_the_stage_itself():
+    def stage():
+        return jnp.arange(3.0), jnp.array(2, jnp.int32)
+
+    repeated = once(stage, jnp.array(1, jnp.int32))
+    jax.tree.map(np.testing.assert_array_equal, repeated, stage())
+    jax.tree.map(np.testing.assert_array_equal, once(stage, None), stage())

@@ -1,0 +1,198 @@
+import json
+import warnings
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+from fake_fit import BANDS, blurred_ring, fake_result, fake_target
+
+from diffdisp.dispersion import Sellmeier
+from diffdisp.glasses import named_glass
+from diffdisp.image import Picture
+from diffdisp.report import (
+    fit_json,
+    result_table,
+    write_fit_json,
+    write_glass_plot,
+    write_report,
+)
+
+KEYS = {
+    *("converged", "message", "steps", "B", "C", "B_std", "C_std", "covariance", "n_d"),
+    *("n_d_std", "V_d", "V_d_std", "P_gF", "wavelength", "n", "n_std", "singular_values"),
+    *("determined", "summary", "rms_residual", "nearest_glasses"),
+    *("object", "prior", "P_gF_std"),
+}
+
+
+def size_of(path):
+    """Width and height of a .png that is not blank."""
+    pixels = iio.imread(path)
+    assert pixels.std() > 5
+    return pixels.shape[1], pixels.shape[0]
+
+
+def test_json_has_the_promised_keys():
+    assert fit_json(fake_result()).keys() == KEYS
+
+
+def test_json_holds_the_numbers(tmp_path):
+    result = fake_result()
+    write_fit_json(tmp_path / "fit.json", result)
+    read = json.loads((tmp_path / "fit.json").read_text(encoding="utf-8"))
+    assert read["B"] == result.B.tolist()
+    assert read["wavelength"] == BANDS.tolist()
+    assert np.shape(read["covariance"]) == (6, 6)
+    assert read["nearest_glasses"][0] == {
+        "name": "N-BK7",
+        "distance": pytest.approx(result.nearest_glasses[0][1]),
+    }
+    assert read["converged"] is True
+    assert [file.name for file in tmp_path.iterdir()] == ["fit.json"]
+
+
+def test_json_has_null_for_what_is_not_finite(tmp_path):
+    unknown = np.array([1.0, np.inf, np.nan])
+    result = fake_result(
+        C_std=unknown,
+        covariance=np.full((6, 6), np.inf),
+        V_d=float("nan"),
+        rms_residual=np.float64("inf"),
+        nearest_glasses=(("N-BK7", float("inf")),),
+    )
+    write_fit_json(tmp_path / "fit.json", result)
+
+    def refuse(constant):
+        raise AssertionError(f"{constant} is no JSON")
+
+    text = (tmp_path / "fit.json").read_text(encoding="utf-8")
+    read = json.loads(text, parse_constant=refuse)
+    assert read["C_std"] == [1.0, None, None]
+    assert read["covariance"] == [[None] * 6] * 6
+    assert read["V_d"] is None
+    assert read["rms_residual"] is None
+    assert read["nearest_glasses"] == [{"name": "N-BK7", "distance": None}]
+
+
+def test_failed_write_leaves_the_old_file(tmp_path):
+    (tmp_path / "fit.json").write_text("old")
+    with pytest.raises(TypeError):
+        write_fit_json(tmp_path / "fit.json", fake_result(message=object()))
+    assert (tmp_path / "fit.json").read_text() == "old"
+    assert [file.name for file in tmp_path.iterdir()] == ["fit.json"]
+
+
+def test_table_of_a_converged_fit():
+    lines = result_table(fake_result()).splitlines()
+    assert "converged  yes, 7 steps" in lines
+    assert "n_d        1.5168049 ± 0.0000032" in lines
+    assert "V_d        64.171 ± 0.021" in lines
+    assert "B2         0.23 ± 0.95   undetermined" in lines
+    assert "determined 3 of 6 directions" in lines
+    assert any(line.startswith("nearest    N-BK7 254 σ, ") for line in lines)
+    assert "residual   0.00103 rms" in lines
+    assert lines[-1].endswith("alone.")
+    assert max(map(len, lines)) <= 79
+
+
+def test_table_of_what_is_fixed_unknown_or_failed():
+    result = fake_result(
+        converged=False,
+        message="too many steps",
+        steps=1,
+        B_std=np.array([0.0, np.inf, 1e-4]),
+        V_d=float("inf"),
+        n_d_std=float("nan"),
+    )
+    lines = result_table(result).splitlines()
+    assert "converged  NO, 1 step" in lines
+    assert "message    too many steps" in lines
+    assert any(line.startswith("B1  ") and line.endswith("held fixed") for line in lines)
+    assert "B2         0.2317947 ± unknown   undetermined" in lines
+    assert "B3         1.01048 ± 0.00010" in lines
+    assert "V_d        not defined" in lines
+    assert "n_d        1.516805 ± unknown" in lines
+
+
+INFRARED = np.array([1.0, 1.5, 2.3])
+
+
+@pytest.mark.parametrize(
+    ("target", "result"),
+    [
+        (fake_target(), fake_result()),
+        (fake_target(None), fake_result(channels=3)),
+        (fake_target(INFRARED), fake_result(INFRARED, 3)),
+        (fake_target(np.array([0.55])), fake_result(np.array([0.55]), 1)),
+        (fake_target(BANDS[::-1]), fake_result(BANDS[::-1].copy())),
+        (
+            Picture(np.zeros((32, 32, 16)), BANDS),
+            fake_result(
+                picture=np.zeros((32, 32, 16)),
+                n_std=np.full(16, np.inf),
+                nearest_glasses=(),
+                summary="costs $1 or $2",
+                object_name="a $name$ " + "that does not end " * 5,
+                converged=False,
+                message="it did not reach a minimum within the 60 steps that it may take " * 2,
+            ),
+        ),
+    ],
+    ids=["bands", "colour", "infrared", "one band", "falling", "nothing known"],
+)
+def test_report_is_drawn(tmp_path, target, result):
+    write_report(tmp_path / "report.png", result, target)
+    assert size_of(tmp_path / "report.png") == (1620, 984)
+    assert [file.name for file in tmp_path.iterdir()] == ["report.png"]
+
+
+def test_report_leaves_matplotlib_alone(tmp_path):
+    import matplotlib
+    import matplotlib.pyplot
+
+    before = dict(matplotlib.rcParams), matplotlib.pyplot.get_fignums()
+    write_report(tmp_path / "report.png", fake_result(), fake_target())
+    assert (dict(matplotlib.rcParams), matplotlib.pyplot.get_fignums()) == before
+
+
+def test_report_shows_the_residual(tmp_path):
+    """Another fit, another picture: the panels are drawn from the data."""
+    write_report(tmp_path / "a.png", fake_result(), fake_target())
+    shifted = np.roll(blurred_ring(32, 16), 3, axis=1)
+    write_report(tmp_path / "b.png", fake_result(picture=shifted), fake_target())
+    assert (tmp_path / "a.png").read_bytes() != (tmp_path / "b.png").read_bytes()
+
+
+@pytest.mark.parametrize(
+    "glass",
+    [
+        named_glass("N-BK7"),
+        Sellmeier([1.0, 0.2, 0.9], [0.006, 0.02, 103.0]),
+        Sellmeier([1.0, 0.2, 0.9], [0.006, 0.02, 103.0], (0.0, 1e9), "$wide$"),
+        Sellmeier([1.0, 0.2, 0.9], [0.006, 0.02, 103.0], (3.0, np.inf)),
+        Sellmeier([1.0, 0.2, 0.9], [0.006, 0.02, 103.0], (60.0, 70.0)),
+        Sellmeier([1.0, 0.2, 0.9], [0.006, 0.02, 103.0], (0.01, 0.02)),
+        Sellmeier([1.0, 0.0, 0.0], [0.25, 0.0, 0.0]),  # a pole at 0.5 µm
+        Sellmeier([0.0, 0.0, 0.0], [0.0, 0.0, 0.0]),
+    ],
+)
+def test_glass_plot(tmp_path, glass):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        write_glass_plot(tmp_path / "n.png", glass)
+    assert size_of(tmp_path / "n.png") == (840, 540)
+
+
+@pytest.mark.parametrize("suffix", [".pdf", ".svg", ".PNG"])
+def test_other_formats_of_plots(tmp_path, suffix):
+    write_glass_plot(tmp_path / f"n{suffix}", named_glass("N-BK7"))
+    assert [file.name for file in tmp_path.iterdir()] == [f"n{suffix}"]
+
+
+@pytest.mark.parametrize(
+    ("name", "message"), [("n.jpeg", r"one of \.png"), ("no/n.png", "no folder"), ("", "ends in")]
+)
+def test_plots_that_cannot_be_written(tmp_path, name, message):
+    with pytest.raises(ValueError, match=message):
+        write_glass_plot(tmp_path / name, named_glass("N-BK7"))
+    assert list(tmp_path.iterdir()) == []
