@@ -74,7 +74,7 @@ def fake_result(wavelengths: np.ndarray = BANDS, channels: int = 16, **changes) 
         nearest_glasses=tuple((name, distance) for distance, name in nearest[:5]),
         prior="none",
         noise=None,
-        samples=64,
+        samples=(16, 144),
         picture=blurred_ring(32, channels),
     )
     return replace(result, **changes)

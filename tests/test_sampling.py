@@ -1,3 +1,5 @@
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +14,8 @@ def points(pixel, count, dimension, seed=0):
     """The first `count` numbers of a pixel in one dimension."""
     words = [jnp.asarray(v, jnp.uint32) for v in (pixel, dimension, STEPS[dimension], seed)]
     sample = jnp.arange(count, dtype=jnp.uint32)
-    each = jax.vmap(low_discrepancy, (None, 0, None, None, None))
+    dtype = jnp.result_type(float).name
+    each = jax.vmap(partial(low_discrepancy, dtype=dtype), (None, 0, None, None, None))
     return np.asarray(each(words[0], sample, *words[1:]))
 
 

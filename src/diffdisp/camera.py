@@ -25,7 +25,7 @@ class Camera(eqx.Module):
     vertical_fov: Real = eqx.field(default=45.0, converter=real_array)
 
 
-def camera_ray(camera: Camera, height: int, x: Real, y: Real, middle: tuple[Real, Real]) -> Ray:
+def camera_ray(camera: Camera, height: Real, x: Real, y: Real, middle: tuple[Real, Real]) -> Ray:
     """The ray through a point of the film.
 
     Args:

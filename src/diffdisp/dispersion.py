@@ -96,13 +96,13 @@ def domain_error(glass: Sellmeier, low: float, high: float) -> str | None:
     """
     B, C = np.asarray(glass.B, np.float64), np.asarray(glass.C, np.float64)
     for b, c in zip(B, C, strict=True):
-        if b != 0 and c >= 0 and low**2 <= c <= high**2:
+        if b != 0 and c >= 0 and low <= np.sqrt(c) <= high:
             return f"has a pole at {np.sqrt(c) * 1e3:.6g} nm"
     squared = np.linspace(low, high, 2001) ** 2
     squared[0], squared[-1] = low**2, high**2
-    n_squared = 1.0 + sum(
-        b * squared / (squared - c) for b, c in zip(B, C, strict=True) if b != 0
-    )
+    n_squared = np.ones_like(squared)
+    for b, c in zip(B, C, strict=True):
+        n_squared += b * squared / (squared - c) if b != 0 else 0.0
     bad = np.flatnonzero(~(n_squared > 0) | ~np.isfinite(n_squared))
     if len(bad):
         return f"has n² ≤ 0 at {np.sqrt(squared[bad[0]]) * 1e3:.6g} nm"

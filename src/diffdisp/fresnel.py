@@ -26,7 +26,7 @@ def cos_transmitted(cos_i: Real, eta: Real) -> Real:
         eta: index behind the surface over index before it.
     """
     # (η - 1)(η + 1) keeps what η² - 1 would cancel where the two media are nearly the same.
-    return safe_sqrt((eta - 1.0) * (eta + 1.0) + cos_i * cos_i, least_square()) / eta
+    return safe_sqrt((eta - 1.0) * (eta + 1.0) + cos_i * cos_i, least_square(cos_i)) / eta
 
 
 def refract(direction: Vec3, normal: Vec3, cos_i: Real, cos_t: Real, eta: Real) -> Vec3:

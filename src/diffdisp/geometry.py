@@ -43,7 +43,7 @@ def sphere_distances(ray: Ray, center: Vec3, radius: Real) -> tuple[Real, Real, 
     b = -to_origin.dot(ray.direction)
     foot = to_origin + ray.direction * b
     discriminant = radius * radius - foot.dot(foot)
-    least = least_square() * radius * radius
+    least = least_square(b) * radius * radius
     root = safe_sqrt(discriminant, least)
     q = b + jnp.where(b < 0, -root, root)
     product = to_origin.dot(to_origin) - radius * radius

@@ -75,7 +75,7 @@ def world_tables(scene: Scene) -> World:
         _table([vec3(p.point) for p, _ in planes]),
         normals,
         jax.vmap(plane_axes)(normals),
-        _row([_tile(obj) for _, obj in planes]),
+        _row([_tile(obj, scene) for _, obj in planes]),
     )
 
 
@@ -106,9 +106,10 @@ def _table(vectors: list[Vec3]) -> Vec3:
     return Vec3(*(_row([v[axis] for v in vectors]) for axis in range(3)))
 
 
-def _tile(obj: Object) -> Real:
+def _tile(obj: Object, scene: Scene) -> Real:
     texture = obj.material.texture if isinstance(obj.material, Emitter) else None
-    return texture.tile if isinstance(texture, Checker2D) else jnp.ones(())
+    one = jnp.ones_like(scene.camera.vertical_fov)
+    return texture.tile if isinstance(texture, Checker2D) else one
 
 
 def _even_odd(obj: Object) -> tuple[Triple, Triple]:
@@ -260,7 +261,7 @@ def start_path(
 def surface_indices(
     point: Vec3, normal: Vec3, ball: jax.Array, indices: jax.Array, world: World, plan: Plan
 ) -> tuple[Real, Real, jax.Array]:
-    """Index outside and inside of a ball's surface, and whether the two media differ.
+    """Index outside and inside of a ball's surface, and whether there is an interface at all.
 
     The medium is the smallest glass ball that contains the point just off the surface (of equal
     ones the later), else air.
@@ -268,24 +269,26 @@ def surface_indices(
     if not plan.nested:
         return jnp.ones_like(point.x), _pick(indices, ball), jnp.ones(point.x.shape, bool)
     off = _pick(world.radii, ball) * (1e-8 if plan.dtype == "float64" else 1e-4)
-    sides = []
-    for sign in (1.0, -1.0):
-        beside = point + normal * (off * sign)
-        best = (jnp.full_like(off, jnp.inf), jnp.ones_like(off), jnp.full_like(ball, -1))
-        for number in range(plan.balls):
-            center = vec3_row(world.centers, number)
-            offset = beside - center
-            within = offset.dot(offset) < world.radii[number] * world.radii[number]
-            within = jnp.where(ball == number, sign < 0, within)
-            smaller = within & (world.radii[number] <= best[0])
-            best = tuple(
-                jnp.where(smaller, new, old)
-                for new, old in zip(
-                    (world.radii[number], indices[number], number), best, strict=True
-                )
-            )
-        sides.append(best)
-    return sides[0][1], sides[1][1], sides[0][2] != sides[1][2]
+    n_out, n_in = (
+        _medium(point + normal * (off * sign), ball, sign < 0, indices, world, plan)
+        for sign in (1.0, -1.0)
+    )
+    return n_out, n_in, n_out != n_in
+
+
+def _medium(
+    beside: Vec3, ball: jax.Array, inside: bool, indices: jax.Array, world: World, plan: Plan
+) -> Real:
+    """Index of the medium at a point just off the surface of `ball`, on a side that is known."""
+    smallest, index = jnp.full_like(beside.x, jnp.inf), jnp.ones_like(beside.x)
+    for number in range(plan.balls):
+        offset = beside - vec3_row(world.centers, number)
+        radius = world.radii[number]
+        within = jnp.where(ball == number, inside, offset.dot(offset) < radius * radius)
+        nearer = within & (radius <= smallest)
+        smallest = jnp.where(nearer, radius, smallest)
+        index = jnp.where(nearer, indices[number], index)
+    return index
 
 
 def vec3_row(table: Vec3, number: int) -> Vec3:
@@ -529,7 +532,8 @@ def _through_glass(
     plan: Plan, indices: tuple, lanes: Lanes, paths: Path, loop: Callable
 ) -> Path:
     """The paths followed to their ends."""
-    world, steps = lanes.world, jnp.asarray(sequence_steps(plan.depth))
+    world = lanes.world
+    steps = jnp.asarray(sequence_steps(plan.depth if plan.random else 1))
     index = jnp.stack(indices, axis=-1)
     by_sample = 0 if index.ndim == 3 else None
 
@@ -543,7 +547,8 @@ def _through_glass(
     ) -> Path:
         def branch(bounces: jax.Array) -> Real:
             word = bounces.astype(jnp.uint32)
-            return low_discrepancy(pixel, sample, word, steps[bounces], lanes.seed)
+            step = steps[bounces]
+            return low_discrepancy(pixel, sample, word, step, lanes.seed, plan.dtype)
 
         side = path.last == path.ball if inside is None else inside
         return bounce(path, branch, index, world, emission, plan, side, lanes.cutoff, lanes.one)
@@ -569,7 +574,7 @@ def _until_done(advance: Callable, paths: Path, plan: Plan) -> Path:
 def _bounded(advance: Callable, paths: Path, plan: Plan) -> Path:
     """All paths to their ends in a fixed number of turns, idle ones skipped; any derivative."""
     # Borders between equal media count for no bounce; a chord meets two of each ball at most.
-    turns = (plan.depth - 1) * (2 * plan.balls - 1 if plan.nested else 1)
+    turns = (plan.depth - 1) * (2 * plan.balls if plan.nested else 1)
 
     def turn(paths: Path, _: None) -> tuple[Path, None]:
         return _unless_done(advance, paths), None

@@ -19,7 +19,8 @@ from diffdisp.film import Film
 from diffdisp.integrator import Lanes, emission_table, lane_radiance, world_tables
 from diffdisp.planning import Plan, make_plan
 from diffdisp.sampling import sample_grid
-from diffdisp.scene import Scene, is_glass, object_glass
+from diffdisp.scene import Scene, is_glass, object_glass, without_names
+from diffdisp.vector import Real
 
 COLOR_RANGE = (0.38, 0.78)
 """Wavelengths that a colour picture is made of, µm."""
@@ -55,7 +56,9 @@ class RunNumbers(NamedTuple):
 def run_numbers(plan: Plan, seed: int, cutoff: float | None = None) -> RunNumbers:
     """Numbers of a run; without `cutoff` a path ends beneath the last digit of its light."""
     least = 0.1 * float(np.finfo(plan.dtype).eps) if cutoff is None else cutoff
-    return RunNumbers(np.uint32(seed % 2**32), np.asarray(least), np.int32(1))
+    return RunNumbers(
+        np.asarray(seed % 2**32, np.uint32), np.asarray(least), np.asarray(1, np.int32)
+    )
 
 
 def render(
@@ -214,7 +217,7 @@ def render_pixels(
 ) -> Float[np.ndarray, "chunks pixels channels"]:
     """The pixels of a scene without traced numbers, on all cores."""
 
-    spectrum, size = film_spectrum(film, plan), film_size(film)
+    spectrum, size, scene = film_spectrum(film, plan), film_size(film), without_names(scene)
 
     def run(part: Pixels) -> np.ndarray:
         return np.asarray(
@@ -235,7 +238,9 @@ def over_chunks(
     XLA's CPU backend keeps to one core what a program does to a few thousand numbers at a time,
     but threads may run it side by side. Parts are of equal length so that one program serves all.
     """
-    total, length = len(chunks.x), CHUNKS_PER_CALL
+    total = len(chunks.x)
+    # Few lengths are few programs; a small picture is not worth sixteen chunks.
+    length = min(CHUNKS_PER_CALL, 1 << (total - 1).bit_length())
     starts = list(range(0, total, length))
     stop = threading.Event()
 
@@ -308,7 +313,7 @@ def chunk_lanes(
     plan: Plan,
     scene: Scene,
     spectrum: Spectrum,
-    size: tuple[jax.Array, jax.Array],
+    size: tuple[Real, Real],
     pixels: Pixels,
     run: RunNumbers,
 ) -> Lanes:
@@ -355,7 +360,7 @@ def chunk_lanes(
 
 def combine(
     lanes: Float[jax.Array, "wavelengths samples pixels channels"], spectrum: Spectrum
-) -> Float[jax.Array, "pixels channels"]:
+) -> Float[jax.Array, "pixels film_channels"]:
     """The film's channels of each pixel, from what its lanes add."""
     if spectrum.weights is not None:
         return jnp.sum(lanes, axis=(0, 1))
@@ -368,7 +373,7 @@ def _render_chunks(
     plan: Plan,
     scene: Scene,
     spectrum: Spectrum,
-    size: tuple[jax.Array, jax.Array],
+    size: tuple[Real, Real],
     chunks: Pixels,
     run: RunNumbers,
 ) -> Float[jax.Array, "chunks pixels channels"]:

@@ -101,3 +101,19 @@ def with_glass(scene: Scene, index: int, glass: Sellmeier) -> Scene:
     old = objects[index]
     objects[index] = Object(old.shape, Dielectric(glass), old.name)
     return Scene(scene.camera, tuple(objects), scene.background)
+
+
+def without_names(scene: Scene) -> Scene:
+    """The scene without names: they are static, but no other program."""
+    return Scene(
+        scene.camera,
+        tuple(Object(obj.shape, _nameless(obj.material)) for obj in scene.objects),
+        scene.background,
+    )
+
+
+def _nameless(material: Material) -> Material:
+    if not isinstance(material, Dielectric):
+        return material
+    glass = material.glass
+    return Dielectric(Sellmeier(glass.B, glass.C, glass.validity))

@@ -55,8 +55,11 @@ def filtered_square_wave(x: Real, across: Real, down: Real) -> Real:
     # A box far narrower than the other smooths nothing, but dividing by it would cancel digits.
     narrow = jnp.maximum(jnp.minimum(jnp.abs(across), jnp.abs(down)), 1e-3 * wide)
     reach, flat = 0.5 * (wide + narrow), 0.5 * (wide - narrow)
-    return jnp.where(reach <= 0.5, _near_edge(x, wide, narrow, reach, flat),
-                     _many_edges(x, wide, narrow, reach, flat))
+    return jnp.where(
+        reach <= 0.5,
+        _near_edge(x, wide, narrow, reach, flat),
+        _many_edges(x, wide, narrow),
+    )
 
 
 def _near_edge(x: Real, wide: Real, narrow: Real, reach: Real, flat: Real) -> Real:
@@ -74,11 +77,28 @@ def _near_edge(x: Real, wide: Real, narrow: Real, reach: Real, flat: Real) -> Re
                             jnp.where(distance <= flat, inner, outer))
 
 
-def _many_edges(x: Real, wide: Real, narrow: Real, reach: Real, flat: Real) -> Real:
-    """The filtered wave as second differences of the twice integrated one."""
-    area = jnp.where(reach > 0, wide * narrow, 1.0)
-    sums = _integrated(x + reach) - _integrated(x + flat)
-    return (sums - _integrated(x - flat) + _integrated(x - reach)) / area
+def _many_edges(x: Real, wide: Real, narrow: Real) -> Real:
+    """The filtered wave as a difference, over the wide box, of its integral under the narrow one.
+
+    A second difference over both would cancel digits where the narrow box is a sliver.
+    """
+    size = jnp.where(wide > 0, wide, 1.0)
+    return (_mean_ramp(x + 0.5 * wide, narrow) - _mean_ramp(x - 0.5 * wide, narrow)) / size
+
+
+def _mean_ramp(x: Real, width: Real) -> Real:
+    """Mean over a box of the integrated wave, which rises and falls between 0 and 1."""
+    small = width <= 1.0
+    half = 0.5 * jnp.where(small, width, 1.0)
+    kink = jnp.round(x)
+    rising = 1.0 - 2.0 * jnp.abs(kink - 2.0 * jnp.round(0.5 * kink))
+    distance = jnp.abs(x - kink)
+    near = distance < half
+    rounded = (distance * distance + half * half) / jnp.where(near, 2.0 * half, 1.0)
+    one_kink = rising * jnp.where(near, rounded, distance) + 0.5 * (1.0 - rising)
+    broad = jnp.where(small, 1.0, width)
+    difference = (_integrated(x + 0.5 * broad) - _integrated(x - 0.5 * broad)) / broad
+    return jnp.where(small, one_kink, difference + 0.5)
 
 
 def _integrated(x: Real) -> Real:

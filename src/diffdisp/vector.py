@@ -66,13 +66,13 @@ def choose(condition: jax.Array | bool, a: Any, b: Any) -> Any:
     return jax.tree.map(lambda p, q: jnp.where(condition, p, q), a, b)
 
 
-def least_square() -> float:
-    """Squared cosines below this count as zero: 1e-10 in float32, 1e-20 in float64.
+def least_square(like: Real) -> float:
+    """Squared cosines below this count as zero: 1e-10 in float32, 1e-20 in float64, as `like` is.
 
     A root has an infinite slope at zero, and second derivatives grow as its cube; this far from
     zero they stay within the range of the type, and what is cut off is seen by no pixel.
     """
-    return 1e-20 if jnp.result_type(float) == jnp.float64 else 1e-10
+    return 1e-20 if jnp.result_type(like) == jnp.float64 else 1e-10
 
 
 def safe_sqrt(x: Real, above: Real | float = 0.0) -> Real:
