@@ -6,7 +6,7 @@ import numpy as np
 
 from diffdisp.dispersion import real_array
 from diffdisp.geometry import Ray
-from diffdisp.vector import Real, Triple, Vec3, normalize, vec3
+from diffdisp.vector import Real, Triple, normalize, vec3
 
 
 class Camera(eqx.Module):

@@ -55,7 +55,7 @@ class Sellmeier(eqx.Module):
 
     def indices(
         self, wavelengths: Float[jax.Array | np.ndarray, " k"]
-    ) -> Float[jax.Array, " k"]:
+    ) -> Float[jax.Array | np.ndarray, " k"]:
         """`refractive_index` at each of `wavelengths` (K,), µm."""
         return jax.vmap(self.refractive_index)(jnp.asarray(wavelengths))
 
@@ -67,13 +67,19 @@ class Sellmeier(eqx.Module):
     @property
     def V_d(self) -> Real:
         """Abbe number (n_d - 1) / (n_F - n_C), dimensionless; infinite without dispersion."""
-        n_F, n_C = self.refractive_index(np.asarray(LINE_F)), self.refractive_index(np.asarray(LINE_C))
+        n_F, n_C = (
+            self.refractive_index(np.asarray(LINE_F)),
+            self.refractive_index(np.asarray(LINE_C)),
+        )
         return (self.n_d - 1.0) / (n_F - n_C)
 
     @property
     def P_gF(self) -> Real:
         """Relative partial dispersion (n_g - n_F) / (n_F - n_C), dimensionless."""
-        n_F, n_C = self.refractive_index(np.asarray(LINE_F)), self.refractive_index(np.asarray(LINE_C))
+        n_F, n_C = (
+            self.refractive_index(np.asarray(LINE_F)),
+            self.refractive_index(np.asarray(LINE_C)),
+        )
         return (self.refractive_index(np.asarray(LINE_G)) - n_F) / (n_F - n_C)
 
 

@@ -9,7 +9,7 @@ ill-conditioned as it is, in milliseconds.
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -46,7 +46,7 @@ from diffdisp.rendering import (
     some_blocks,
 )
 from diffdisp.scene import Scene, is_glass, object_glass, with_glass, without_names
-from diffdisp.vector import Real
+from diffdisp.vector import Array, Real
 
 ASSUMED_NOISE = 1e-3
 """Noise that errors refer to where a picture shows none: that of a good camera, in radiance."""
@@ -190,7 +190,7 @@ class Coefficients(eqx.Module):
         C = np.where(self.C < self.low**2, _log(below) - _log(1 - below), _log(above))
         return np.concatenate([_log(np.abs(self.B)), C])[list(self.free)]
 
-    def values(self, z: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def values(self, z: Array) -> tuple[jax.Array, jax.Array]:
         """B and C (3,) at coordinates `z` (free,)."""
         free = np.array(self.free)
         full = jnp.zeros(6).at[np.flatnonzero(free)].set(z)
@@ -200,8 +200,8 @@ class Coefficients(eqx.Module):
         C = jnp.where(below, self.low**2 * jax.nn.sigmoid(full[3:]), above)
         return jnp.where(free[:3], B, self.B), jnp.where(free[3:], C, self.C)
 
-    def index(self, z: jax.Array, wavelengths: jax.Array | np.ndarray) -> jax.Array:
-        """n (k,) at `wavelengths` (k,), µm; continued smoothly where n² would fall below 1/4."""
+    def index(self, z: Array, wavelengths: jax.Array | np.ndarray) -> jax.Array:
+        """N (k,) at `wavelengths` (k,), µm; continued smoothly where n² would fall below 1/4."""
         B, C = self.values(z)
         squared = jnp.asarray(wavelengths)[:, None] ** 2
         zero = (B == 0)[None, :]
@@ -210,14 +210,14 @@ class Coefficients(eqx.Module):
         low = 0.25 * jnp.exp(jnp.minimum(n_squared / 0.25 - 1, 0.0))
         return jnp.sqrt(jnp.where(n_squared > 0.25, n_squared, low))
 
-    def logarithms(self, z: jax.Array) -> jax.Array:
-        """log |B| and log C (free,) at `z`, in which results are reported."""
+    def logarithms(self, z: Array) -> jax.Array:
+        """Log |B| and log C (free,) at `z`, in which results are reported."""
         B, C = self.values(z)
         return jnp.log(jnp.abs(jnp.concatenate([B, C])[np.flatnonzero(self.free)]))
 
 
 def _log(x: np.ndarray) -> np.ndarray:
-    """log of the positive ones; 0 for the others, which are held fixed."""
+    """Log of the positive ones; 0 for the others, which are held fixed."""
     return np.log(np.where(x > 0, x, 1.0))
 
 
@@ -241,7 +241,7 @@ class Unknowns(NamedTuple):
     prior_mean: np.ndarray
     prior_rows: np.ndarray
 
-    def change(self, z: jax.Array, index: jax.Array) -> jax.Array:
+    def change(self, z: Array, index: Array) -> Array:
         """Coordinates (m,) of the change from `index` at the reference wavelengths to n at `z`."""
         return self.project @ (self.coefficients.index(z, self.reference) - index)
 
@@ -447,7 +447,7 @@ def _prior(prior: str, C: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.
     return whiten @ mean, rows
 
 
-def _by_C(C: np.ndarray) -> np.ndarray:
+def _by_C(C: Array) -> np.ndarray:
     """Order (6,) of B1 B2 B3 C1 C2 C3 in which C rises."""
     order = np.argsort(C)
     return np.concatenate([order, order + 3])
@@ -486,23 +486,21 @@ def _traced(
     size: tuple[Real, Real],
     chunks: Pixels,
     run: RunNumbers,
-    index: jax.Array,
-    tangents: jax.Array,
+    index: Array,
+    tangents: Array,
 ) -> jax.Array:
     """Pixels (chunks, pixels, 1 + t, channels): radiance, and its change along each tangent."""
-    scene, spectrum, size, chunks, run = in_dtype(
-        (scene, spectrum, size, chunks, run), plan.dtype
-    )
+    scene, spectrum, size, chunks, run = in_dtype((scene, spectrum, size, chunks, run), plan.dtype)
     indices = glass_indices(scene, spectrum.wavelengths)
 
-    def chunk(pixels: Pixels) -> jax.Array:
+    def chunk(pixels: Pixels) -> Array:
         lanes = chunk_lanes(plan, scene, spectrum, size, pixels, run)
 
-        def of_index(index: jax.Array) -> jax.Array:
+        def of_index(index: Array) -> Array:
             changed = (*indices[:ball], index, *indices[ball + 1 :])
             return combine(lane_radiance(plan, changed, lanes), spectrum)
 
-        def change(tangent: jax.Array) -> tuple[jax.Array, jax.Array]:
+        def change(tangent: Array) -> tuple[Array, Array]:
             return jax.jvp(of_index, (index,), (tangent,))
 
         value, slopes = jax.vmap(change, out_axes=(None, 0))(tangents)
@@ -523,7 +521,15 @@ def _trace(
     size, run = film_size(problem.film), run_numbers(part.plan, seed, cutoff)
 
     def trace(chunks: Pixels) -> np.ndarray:
-        fixed = (without_names(problem.scene), part.spectrum, size, chunks, run, index, part.tangents)
+        fixed = (
+            without_names(problem.scene),
+            part.spectrum,
+            size,
+            chunks,
+            run,
+            index,
+            part.tangents,
+        )
         return np.asarray(_traced_jit(part.plan, problem.ball, *fixed))
 
     values = over_chunks(trace, part.chunks, "float64")
@@ -569,7 +575,7 @@ class Step(NamedTuple):
     Args:
         unknowns: what is looked for.
         z0: (free,) where the picture was linearised.
-        index: (k,) n at the reference wavelengths there.
+        n: (k,) index at the reference wavelengths there.
         r: (m, m) as in `Linearised`.
         q: (m,) as in `Linearised`.
         damping: (m,) weights that keep the change of n within what a linear picture can tell.
@@ -579,20 +585,20 @@ class Step(NamedTuple):
     """
 
     unknowns: Unknowns
-    z0: jax.Array
-    index: jax.Array
-    r: jax.Array
-    q: jax.Array
-    damping: jax.Array
-    anchor: jax.Array
-    near: jax.Array
-    prior: jax.Array
+    z0: Array
+    n: Array
+    r: Array
+    q: Array
+    damping: Array
+    anchor: Array
+    near: Array
+    prior: Array
 
 
-def _step_rows(dz: jax.Array, step: Step) -> jax.Array:
+def _step_rows(dz: Array, step: Step) -> jax.Array:
     """Residuals (rows,) of a step."""
     unknowns, z = step.unknowns, step.z0 + dz
-    change = unknowns.change(z, step.index)
+    change = unknowns.change(z, step.n)
     logs = unknowns.prior_rows @ unknowns.coefficients.logarithms(z) - unknowns.prior_mean
     return jnp.concatenate(
         [
@@ -605,7 +611,7 @@ def _step_rows(dz: jax.Array, step: Step) -> jax.Array:
 
 
 @jax.jit
-def _solve_step(step: Step) -> jax.Array:
+def _solve_step(step: Step) -> Array:
     """Coordinates z (free,) that a step leads to.
 
     The directions in which n(λ) hardly changes are long curved valleys. Levenberg-Marquardt walks
@@ -613,8 +619,8 @@ def _solve_step(step: Step) -> jax.Array:
     Whether the solver met its tolerance does not matter here: a step that is not the best still
     has to lower the picture's own sum of squares, and the next one starts from it.
     """
-    solver = optx.LevenbergMarquardt(rtol=1e-12, atol=1e-12)
-    solution = optx.least_squares(
+    solver: Any = optx.LevenbergMarquardt(rtol=1e-12, atol=1e-12)
+    solution: Any = optx.least_squares(
         _step_rows, solver, jnp.zeros_like(step.z0), args=step, max_steps=50_000, throw=False
     )
     return step.z0 + solution.value
@@ -641,7 +647,9 @@ def _next_z(
     return np.asarray(_solve_step(step))
 
 
-def _objective(unknowns: Unknowns, lin: Linearised, z: np.ndarray, anchor: np.ndarray, noise: float) -> float:
+def _objective(
+    unknowns: Unknowns, lin: Linearised, z: np.ndarray, anchor: np.ndarray, noise: float
+) -> float:
     """What a step has to lower: squared residuals, and what is known besides, in their unit."""
     known = unknowns.prior_rows @ np.asarray(unknowns.coefficients.logarithms(z))
     far = np.sum(((z - anchor) / WIDEST) ** 2) + np.sum((known - unknowns.prior_mean) ** 2)
@@ -804,13 +812,11 @@ def _traced_at_indices(
     run: RunNumbers,
 ) -> jax.Array:
     """Pixels (chunks, pixels, indices, 3) with one ball at each index of the grid."""
-    scene, spectrum, size, chunks, run = in_dtype(
-        (scene, spectrum, size, chunks, run), plan.dtype
-    )
+    scene, spectrum, size, chunks, run = in_dtype((scene, spectrum, size, chunks, run), plan.dtype)
     indices = glass_indices(scene, spectrum.wavelengths)
     indices = (*indices[:ball], jnp.asarray(INDEX_GRID), *indices[ball + 1 :])
 
-    def chunk(pixels: Pixels) -> jax.Array:
+    def chunk(pixels: Pixels) -> Array:
         lanes = chunk_lanes(plan, scene, spectrum, size, pixels, run)
         return jnp.moveaxis(lane_radiance(plan, indices, lanes)[:, 0], 0, 1)
 
@@ -851,9 +857,7 @@ def _variants(unknowns: Unknowns, waves: np.ndarray) -> list[np.ndarray]:
     return found
 
 
-def _fit(
-    problem: Problem, target: Picture, prior: str, noise: float | None
-) -> FitResult:
+def _fit(problem: Problem, target: Picture, prior: str, noise: float | None) -> FitResult:
     """Coarse to fine: the best of several starts, then the whole picture, then its final form."""
     film, depth, seed = problem.film, target.depth or 50, target.seed or 0
     coarse = max(1, -(-max(film.width, film.height) // COARSE_PIXELS))
@@ -952,7 +956,7 @@ def _noise(lin: Linearised, given: float | None, brightest: float) -> tuple[np.n
 
 
 def _log_covariance(
-    unknowns: Unknowns, z: jax.Array, lin: Linearised, meat: np.ndarray, noise: float
+    unknowns: Unknowns, z: Array, lin: Linearised, meat: np.ndarray, noise: float
 ) -> np.ndarray:
     """Covariance (free, free) of log |B| and log C.
 
@@ -980,7 +984,7 @@ def _log_covariance(
     return right.T @ total @ right
 
 
-def _line_figures(coefficients: Coefficients, z: jax.Array) -> jax.Array:
+def _line_figures(coefficients: Coefficients, z: Array) -> jax.Array:
     """n_d, V_d and P_gF (3,)."""
     d, F, C, g = coefficients.index(z, np.array([LINE_D, LINE_F, LINE_C, LINE_G]))
     return jnp.stack([d, (d - 1) / (F - C), (g - F) / (F - C)])

@@ -17,7 +17,7 @@ def reflect(direction: Vec3, normal: Vec3, cos_i: Real) -> Vec3:
 
 
 def cos_transmitted(cos_i: Real, eta: Real) -> Real:
-    """cos θₜ = √(η² - 1 + cos²θᵢ) / η; 0, with zero gradient, under total internal reflection.
+    """Cos θₜ = √(η² - 1 + cos²θᵢ) / η; 0, with zero gradient, under total internal reflection.
 
     The usual √(1 - sin²θᵢ/η²) loses 1.7e-4 at grazing incidence in float32.
 

@@ -3,11 +3,10 @@
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 
 from diffdisp.dispersion import real_array
-from diffdisp.vector import Real, Triple, Vec3, choose, least_square, normalize, safe_sqrt
+from diffdisp.vector import Array, Real, Triple, Vec3, choose, least_square, normalize, safe_sqrt
 
 
 class Ray(NamedTuple):
@@ -31,7 +30,7 @@ class Plane(eqx.Module):
     normal: Triple = eqx.field(converter=real_array)
 
 
-def sphere_distances(ray: Ray, center: Vec3, radius: Real) -> tuple[Real, Real, jax.Array]:
+def sphere_distances(ray: Ray, center: Vec3, radius: Real) -> tuple[Real, Real, Array]:
     """Distances t₁ ≤ t₂ along the ray to its line's two points on a sphere, and whether it has any.
 
     Source:

@@ -25,7 +25,7 @@ from diffdisp.planning import Plan
 from diffdisp.sampling import low_discrepancy, sequence_steps
 from diffdisp.scene import Object, Scene, is_glass
 from diffdisp.texture import Checker2D, Solid, filtered_square_wave
-from diffdisp.vector import Real, Triple, Vec3, choose, normalize, vec3
+from diffdisp.vector import Array, Real, Triple, Vec3, choose, normalize, vec3
 
 
 class World(NamedTuple):
@@ -35,11 +35,11 @@ class World(NamedTuple):
     """
 
     centers: Vec3
-    radii: Float[jax.Array, " spheres"]
+    radii: Float[Array, " spheres"]
     points: Vec3
     normals: Vec3
     axes: tuple[Vec3, Vec3]
-    tiles: Float[jax.Array, " planes"]
+    tiles: Float[Array, " planes"]
 
 
 class Emission(NamedTuple):
@@ -48,8 +48,8 @@ class Emission(NamedTuple):
     A checker shows `mean` + m · `half` where m is +1 on its even tiles and -1 on its odd ones.
     """
 
-    mean: Float[jax.Array, "*lanes surfaces channels"]
-    half: Float[jax.Array, "*lanes surfaces channels"]
+    mean: Float[Array, "*lanes surfaces channels"]
+    half: Float[Array, "*lanes surfaces channels"]
 
 
 class Path(NamedTuple):
@@ -57,12 +57,12 @@ class Path(NamedTuple):
 
     ray: Ray
     footprint: tuple[Ray, Ray]
-    ball: Int[jax.Array, ""]
-    last: Int[jax.Array, ""]
+    ball: Int[Array, ""]
+    last: Int[Array, ""]
     throughput: Real
-    radiance: Float[jax.Array, " channels"]
-    bounces: Int[jax.Array, ""]
-    alive: jax.Array
+    radiance: Float[Array, " channels"]
+    bounces: Int[Array, ""]
+    alive: Array
 
 
 def world_tables(scene: Scene) -> World:
@@ -98,7 +98,7 @@ def _planes(scene: Scene) -> list[tuple[Plane, Object]]:
     return [(obj.shape, obj) for obj in scene.objects if isinstance(obj.shape, Plane)]
 
 
-def _row(values: list[Real]) -> Float[jax.Array, " rows"]:
+def _row(values: list[Real]) -> Float[Array, " rows"]:
     return jnp.stack([jnp.asarray(v) for v in values]) if values else jnp.zeros(0)
 
 
@@ -120,16 +120,20 @@ def _even_odd(obj: Object) -> tuple[Triple, Triple]:
     return texture.even * intensity, texture.odd * intensity
 
 
-def _pick(table: jax.Array, index: jax.Array) -> jax.Array:
+def _pick(table: Array, index: Array) -> Array:
     """A row of a table; of a table of one row, that row, without a look-up."""
     return table[0] if table.shape[0] == 1 else table[index]
 
 
-def _pick_vector(table: Vec3, index: jax.Array) -> Vec3:
+def _pick_vector(table: Vec3, index: Array) -> Vec3:
     return Vec3(*(_pick(component, index) for component in table))
 
 
-def nearest(ray: Ray, world: World, plan: Plan, last: jax.Array) -> jax.Array:
+Met = tuple[tuple[Real, Array], None]
+"""Distance and number of the nearest surface so far, as a scan hands them on."""
+
+
+def nearest(ray: Ray, world: World, plan: Plan, last: Array) -> Array:
     """Number of the surface that a ray meets first.
 
     Args:
@@ -144,19 +148,19 @@ def nearest(ray: Ray, world: World, plan: Plan, last: jax.Array) -> jax.Array:
     best = (jnp.full_like(ray.origin.x, jnp.inf), jnp.full_like(last, surfaces))
     numbers = np.arange(surfaces, dtype=np.int32)
 
-    def meet_sphere(best: tuple[Real, jax.Array], row: tuple[Vec3, Real, jax.Array]):
+    def meet_sphere(best: tuple[Real, Array], row: tuple[Vec3, Real, Array]) -> Met:
         center, radius, number = row
         to_origin = ray.origin - center
         near, far, hit = sphere_distances(ray, center, radius)
         # Other surfaces may touch the one that the ray leaves: only there a small offset.
-        least = 1e-6 if plan.dtype == "float32" else 1e-13
-        least = least * (jnp.sqrt(to_origin.dot(to_origin)) + radius)
+        share = 1e-6 if plan.dtype == "float32" else 1e-13
+        least = share * (jnp.sqrt(to_origin.dot(to_origin)) + radius)
         first = jnp.where(near > least, near, far)
         distance = jnp.where(number == last, -2.0 * to_origin.dot(ray.direction), first)
         found = jnp.where(number == last, distance > 0, hit & (first > least))
         return _nearer(best, found, distance, number)
 
-    def meet_plane(best: tuple[Real, jax.Array], row: tuple[Vec3, Vec3, jax.Array]):
+    def meet_plane(best: tuple[Real, Array], row: tuple[Vec3, Vec3, Array]) -> Met:
         distance = plane_distance(ray, row[0], row[1])
         return _nearer(best, distance > 0, distance, row[2])
 
@@ -165,32 +169,32 @@ def nearest(ray: Ray, world: World, plan: Plan, last: jax.Array) -> jax.Array:
     return best[1]
 
 
-def _nearer(
-    best: tuple[Real, jax.Array], found: jax.Array, distance: Real, number: jax.Array
-) -> tuple[tuple[Real, jax.Array], None]:
+def _nearer(best: tuple[Real, Array], found: Array, distance: Real, number: Array) -> Met:
     closer = found & (distance < best[0])
     return (jnp.where(closer, distance, best[0]), jnp.where(closer, number, best[1])), None
 
 
-def _over(step: Callable, start: tuple, rows: tuple, count: int) -> tuple:
+def _over(step: Callable[[Any, Any], tuple[Any, None]], start: Any, rows: Any, count: int) -> Any:
     """`step` over the rows of a table, eight to a turn of the loop; few rows make no loop."""
     return jax.lax.scan(step, start, rows, unroll=min(count, 8))[0] if count else start
 
 
-def push_forward(f: Callable, ray: Ray, footprint: tuple[Ray, Ray]) -> tuple:
+def push_forward(
+    f: Callable[[Ray], tuple[Any, Any]], ray: Ray, footprint: tuple[Ray, Ray]
+) -> tuple[Any, Any, Any]:
     """`f(ray)`, its derivatives along both edges of the footprint, and what else `f` found out."""
     value, push, extra = jax.linearize(f, ray, has_aux=True)
     return value, (push(footprint[0]), push(footprint[1])), extra
 
 
 def emitted(
-    surface: jax.Array,
+    surface: Array,
     ray: Ray,
     footprint: tuple[Ray, Ray],
     world: World,
     emission: Emission,
     plan: Plan,
-) -> Float[jax.Array, " channels"]:
+) -> Float[Array, " channels"]:
     """Radiance (channels,) of the surface that ends a ray, averaged over its footprint."""
     row = jnp.maximum(surface - plan.balls, 0)
     mean = _pick(emission.mean, row)
@@ -259,7 +263,7 @@ def start_path(
 
 
 def surface_indices(
-    point: Vec3, normal: Vec3, ball: jax.Array, indices: jax.Array, world: World, plan: Plan
+    point: Vec3, normal: Vec3, ball: Array, indices: Array, world: World, plan: Plan
 ) -> tuple[Real, Real, jax.Array]:
     """Index outside and inside of a ball's surface, and whether there is an interface at all.
 
@@ -277,7 +281,7 @@ def surface_indices(
 
 
 def _medium(
-    beside: Vec3, ball: jax.Array, inside: bool, indices: jax.Array, world: World, plan: Plan
+    beside: Vec3, ball: Array, inside: bool, indices: Array, world: World, plan: Plan
 ) -> Real:
     """Index of the medium at a point just off the surface of `ball`, on a side that is known."""
     smallest, index = jnp.full_like(beside.x, jnp.inf), jnp.ones_like(beside.x)
@@ -298,14 +302,14 @@ def vec3_row(table: Vec3, number: int) -> Vec3:
 
 def bounce(
     path: Path,
-    branch: Callable[[jax.Array], Real],
-    indices: Float[jax.Array, " balls"],
+    branch: Callable[[Array], Real],
+    indices: Float[Array, " balls"],
     world: World,
     emission: Emission,
     plan: Plan,
-    inside: jax.Array | bool,
+    inside: Array | bool,
     cutoff: Real,
-    one: jax.Array | None,
+    one: Array | None,
 ) -> Path:
     """The path advanced by one glass surface.
 
@@ -316,10 +320,13 @@ def bounce(
         world: the scene's tables.
         emission: what ends paths.
         plan: the scene's static choices.
+        inside: whether the path is inside its ball; True or False where all paths are.
+        cutoff: part of its light with which a path ends.
+        one: as in `once`.
     """
     center, radius = _pick_vector(world.centers, path.ball), _pick(world.radii, path.ball)
 
-    def scatter(ray: Ray) -> tuple[tuple[Ray, Ray], tuple]:
+    def scatter(ray: Ray) -> tuple[tuple[Ray, Ray], tuple[Real, Array]]:
         distance = _distance_to_ball(ray, center, radius, path, plan, inside)
         outward = normalize(ray.origin + ray.direction * distance - center)
         point = center + outward * radius
@@ -373,9 +380,7 @@ def bounce(
     bounces = path.bounces + jnp.where(differ, 1, 0)
     # A path of b bounces has b + 1 segments, and the light that it adds next came over one more.
     alive = path.alive & goes_on & (throughput > cutoff) & (bounces < plan.depth - 1)
-    moved = Path(
-        ray, footprint, ball, path.ball, throughput, path.radiance, bounces, path.alive
-    )
+    moved = Path(ray, footprint, ball, path.ball, throughput, path.radiance, bounces, path.alive)
     # A path that has ended stays where it was: its numbers stay finite.
     kept = choose(alive, moved, path)
     return kept._replace(radiance=radiance, alive=alive)
@@ -384,18 +389,18 @@ def bounce(
 def _next(
     ray: Ray,
     footprint: tuple[Ray, Ray],
-    ball: jax.Array,
+    ball: Array,
     world: World,
     emission: Emission,
     plan: Plan,
-) -> tuple[jax.Array, Float[jax.Array, " channels"]]:
+) -> tuple[Array, Float[Array, " channels"]]:
     """The surface that a ray from `ball` meets first, and what that one emits."""
     surface = nearest(ray, world, plan, ball)
     return surface, emitted(surface, ray, footprint, world, emission, plan)
 
 
 def _distance_to_ball(
-    ray: Ray, center: Vec3, radius: Real, path: Path, plan: Plan, inside: jax.Array | bool
+    ray: Ray, center: Vec3, radius: Real, path: Path, plan: Plan, inside: Array | bool
 ) -> Real:
     """Distance to the ball that the path is known to meet next."""
     across = -2.0 * (ray.origin - center).dot(ray.direction)
@@ -406,7 +411,7 @@ def _distance_to_ball(
     return choose(inside, across, ahead)
 
 
-def once(stage: Callable[[], Any], one: jax.Array | None) -> Any:
+def once(stage: Callable[[], Any], one: Array | None) -> Any:
     """`stage()`, computed once.
 
     XLA's CPU backend fuses loops by computing a value again in each of its users, through any
@@ -435,24 +440,24 @@ class Lanes(NamedTuple):
 
     world: World
     emission: Emission
-    weights: Float[jax.Array, "wavelengths samples channels"] | None
+    weights: Float[Array, "wavelengths samples channels"] | None
     camera: Camera
     height: Real
     middle: tuple[Real, Real]
     cell: tuple[Real, Real]
-    x: Float[jax.Array, "samples pixels"]
-    y: Float[jax.Array, "samples pixels"]
-    pixel: jax.Array
-    sample: jax.Array
-    seed: jax.Array
+    x: Float[Array, "samples pixels"]
+    y: Float[Array, "samples pixels"]
+    pixel: Array
+    sample: Array
+    seed: Array
     cutoff: Real
-    one: jax.Array | None
+    one: Array | None
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def lane_radiance(
-    plan: Plan, indices: tuple[jax.Array, ...], lanes: Lanes
-) -> Float[jax.Array, "wavelengths samples pixels channels"]:
+    plan: Plan, indices: tuple[Array, ...], lanes: Lanes
+) -> Float[Array, "wavelengths samples pixels channels"]:
     """What each lane adds to its pixel.
 
     Light knows a glass only by its index at the light's own wavelength. So all derivatives in a
@@ -473,7 +478,9 @@ def lane_radiance(
 
 
 @partial(lane_radiance.defjvp, symbolic_zeros=True)
-def _lane_radiance_jvp(plan: Plan, primals: tuple, tangents: tuple) -> tuple:
+def _lane_radiance_jvp(
+    plan: Plan, primals: tuple[Any, Any], tangents: tuple[Any, Any]
+) -> tuple[Any, Any]:
     indices, lanes = primals
     radiance = lane_radiance(plan, indices, lanes)
     tangent = jnp.zeros_like(radiance)
@@ -481,7 +488,7 @@ def _lane_radiance_jvp(plan: Plan, primals: tuple, tangents: tuple) -> tuple:
         if isinstance(change, SymbolicZero):
             continue
 
-        def of_index(index: jax.Array, ball: int = ball) -> jax.Array:
+        def of_index(index: Array, ball: int = ball) -> Array:
             changed = (*indices[:ball], index, *indices[ball + 1 :])
             return _radiance(plan, changed, lanes, _until_done)
 
@@ -503,11 +510,14 @@ def _zero(leaf: object) -> bool:
     return isinstance(leaf, SymbolicZero)
 
 
-def _instantiate(tangent: object, primal: jax.Array) -> object:
-    return zero_from_primal(primal) if isinstance(tangent, SymbolicZero) else tangent
+def _instantiate(tangent: object, primal: Array) -> object:
+    return zero_from_primal(primal) if _zero(tangent) else tangent  # type: ignore[no-untyped-call]
 
 
-def _radiance(plan: Plan, indices: tuple, lanes: Lanes, loop: Callable) -> jax.Array:
+Loop = Callable[[Callable[[Path], Path], Path, Plan], Path]
+
+
+def _radiance(plan: Plan, indices: tuple[Array, ...], lanes: Lanes, loop: Loop) -> Array:
     """`lane_radiance`, with the loop that the wanted derivative allows."""
     world = lanes.world
 
@@ -529,7 +539,7 @@ def _radiance(plan: Plan, indices: tuple, lanes: Lanes, loop: Callable) -> jax.A
 
 
 def _through_glass(
-    plan: Plan, indices: tuple, lanes: Lanes, paths: Path, loop: Callable
+    plan: Plan, indices: tuple[Array, ...], lanes: Lanes, paths: Path, loop: Loop
 ) -> Path:
     """The paths followed to their ends."""
     world = lanes.world
@@ -539,13 +549,13 @@ def _through_glass(
 
     def advance(
         path: Path,
-        pixel: jax.Array,
-        sample: jax.Array,
-        index: jax.Array,
+        pixel: Array,
+        sample: Array,
+        index: Array,
         emission: Emission,
         inside: bool | None,
     ) -> Path:
-        def branch(bounces: jax.Array) -> Real:
+        def branch(bounces: Array) -> Real:
             word = bounces.astype(jnp.uint32)
             step = steps[bounces]
             return low_discrepancy(pixel, sample, word, step, lanes.seed, plan.dtype)
@@ -566,12 +576,12 @@ def _through_glass(
     return loop(every_path(True), paths, plan)
 
 
-def _until_done(advance: Callable, paths: Path, plan: Plan) -> Path:
+def _until_done(advance: Callable[[Path], Path], paths: Path, plan: Plan) -> Path:
     """All paths to their ends; no derivative in reverse mode."""
     return jax.lax.while_loop(lambda paths: jnp.any(paths.alive), advance, paths)
 
 
-def _bounded(advance: Callable, paths: Path, plan: Plan) -> Path:
+def _bounded(advance: Callable[[Path], Path], paths: Path, plan: Plan) -> Path:
     """All paths to their ends in a fixed number of turns, idle ones skipped; any derivative."""
     # Borders between equal media count for no bounce; a chord meets two of each ball at most.
     turns = (plan.depth - 1) * (2 * plan.balls if plan.nested else 1)

@@ -11,9 +11,7 @@ from diffdisp.vector import Real
 class Dielectric(eqx.Module):
     """Smooth glass without absorption; `glass` is a `Sellmeier` or the name of one."""
 
-    glass: Sellmeier = eqx.field(
-        converter=lambda g: named_glass(g) if isinstance(g, str) else g
-    )
+    glass: Sellmeier = eqx.field(converter=lambda g: named_glass(g) if isinstance(g, str) else g)
 
 
 class Emitter(eqx.Module):

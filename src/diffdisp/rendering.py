@@ -20,7 +20,7 @@ from diffdisp.integrator import Lanes, emission_table, lane_radiance, world_tabl
 from diffdisp.planning import Plan, make_plan
 from diffdisp.sampling import sample_grid
 from diffdisp.scene import Scene, is_glass, object_glass, without_names
-from diffdisp.vector import Real
+from diffdisp.vector import Array, Real
 
 COLOR_RANGE = (0.38, 0.78)
 """Wavelengths that a colour picture is made of, µm."""
@@ -216,7 +216,6 @@ def render_pixels(
     progress: Callable[[int, int], None] | None = None,
 ) -> Float[np.ndarray, "chunks pixels channels"]:
     """The pixels of a scene without traced numbers, on all cores."""
-
     spectrum, size, scene = film_spectrum(film, plan), film_size(film), without_names(scene)
 
     def run(part: Pixels) -> np.ndarray:
@@ -302,7 +301,7 @@ def film_spectrum(film: Film, plan: Plan) -> Spectrum:
     return Spectrum(wavelengths[taken], None, weights[taken])
 
 
-def glass_indices(scene: Scene, wavelengths: jax.Array) -> tuple[jax.Array, ...]:
+def glass_indices(scene: Scene, wavelengths: Array) -> tuple[Array, ...]:
     """The index of each ball's glass at every wavelength, in the order of the tracer's tables."""
     glasses = [object_glass(scene, i) for i, obj in enumerate(scene.objects) if is_glass(obj)]
     flat = wavelengths.reshape(-1)
@@ -359,8 +358,8 @@ def chunk_lanes(
 
 
 def combine(
-    lanes: Float[jax.Array, "wavelengths samples pixels channels"], spectrum: Spectrum
-) -> Float[jax.Array, "pixels film_channels"]:
+    lanes: Float[Array, "wavelengths samples pixels channels"], spectrum: Spectrum
+) -> Float[Array, "pixels film_channels"]:
     """The film's channels of each pixel, from what its lanes add."""
     if spectrum.weights is not None:
         return jnp.sum(lanes, axis=(0, 1))
@@ -378,22 +377,21 @@ def _render_chunks(
     run: RunNumbers,
 ) -> Float[jax.Array, "chunks pixels channels"]:
     """Mean radiance of each pixel, one chunk after another."""
-    scene, spectrum, size, chunks, run = in_dtype(
-        (scene, spectrum, size, chunks, run), plan.dtype
-    )
+    scene, spectrum, size, chunks, run = in_dtype((scene, spectrum, size, chunks, run), plan.dtype)
     indices = glass_indices(scene, spectrum.wavelengths)
 
-    def chunk(pixels: Pixels) -> jax.Array:
+    def chunk(pixels: Pixels) -> Array:
         lanes = chunk_lanes(plan, scene, spectrum, size, pixels, run)
         return combine(lane_radiance(plan, indices, lanes), spectrum)
 
     return each_chunk(chunk, chunks)
 
 
-def each_chunk(chunk: Callable[[Pixels], jax.Array], chunks: Pixels) -> jax.Array:
+def each_chunk(chunk: Callable[[Pixels], Array], chunks: Pixels) -> jax.Array:
     """`chunk` of one chunk after another."""
     return jax.lax.map(
-        lambda row: chunk(Pixels(*row, chunks.size)), (chunks.x, chunks.y, chunks.number)
+        lambda row: chunk(Pixels(row[0], row[1], row[2], chunks.size)),
+        (chunks.x, chunks.y, chunks.number),
     )
 
 

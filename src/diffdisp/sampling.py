@@ -1,9 +1,8 @@
 """The numbers of (pixel, sample, dimension)."""
 
-import jax
 import numpy as np
 
-from diffdisp.vector import Real
+from diffdisp.vector import Array, Real
 
 
 def sample_grid(samples: int) -> tuple[int, int]:
@@ -15,7 +14,7 @@ def sample_grid(samples: int) -> tuple[int, int]:
     return samples // rows, rows
 
 
-def mixed(word: jax.Array) -> jax.Array:
+def mixed(word: Array) -> Array:
     """A 32-bit word with its bits thoroughly mixed.
 
     Source:
@@ -48,11 +47,11 @@ def sequence_steps(dimensions: int) -> np.ndarray:
 
 
 def low_discrepancy(
-    pixel: jax.Array,
-    sample: jax.Array,
-    dimension: jax.Array,
-    step: jax.Array,
-    seed: jax.Array,
+    pixel: Array,
+    sample: Array,
+    dimension: Array,
+    step: Array,
+    seed: Array,
     dtype: str,
 ) -> Real:
     """A number in [0, 1) of a sequence that every pixel and dimension starts elsewhere.

@@ -1,5 +1,7 @@
 """What a surface shows at a point, averaged over the footprint of a sample."""
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 
@@ -30,7 +32,7 @@ class Checker2D(eqx.Module):
 Texture = Solid | Checker2D
 
 
-def as_texture(value: object) -> object:
+def as_texture(value: Any) -> Texture:
     """A texture as it is; three numbers as the `Solid` they abbreviate."""
     if isinstance(value, Solid | Checker2D):
         return value
@@ -73,8 +75,9 @@ def _near_edge(x: Real, wide: Real, narrow: Real, reach: Real, flat: Real) -> Re
     inner = 2.0 * distance / jnp.where(sharp, 1.0, wide)
     short = jnp.maximum(reach - distance, 0.0)
     outer = 1.0 - short * short / jnp.where(sharp, 1.0, wide * narrow)
-    return side * jnp.where(sharp | (distance >= reach), 1.0,
-                            jnp.where(distance <= flat, inner, outer))
+    return side * jnp.where(
+        sharp | (distance >= reach), 1.0, jnp.where(distance <= flat, inner, outer)
+    )
 
 
 def _many_edges(x: Real, wide: Real, narrow: Real) -> Real:

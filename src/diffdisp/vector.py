@@ -7,6 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+Array = jax.Array | np.ndarray
+"""An array of JAX or of NumPy."""
+
 Real = Float[jax.Array | np.ndarray, ""]
 """One real number; `vmap` makes many of it."""
 
@@ -59,7 +62,7 @@ def vec3(triple: Triple) -> Vec3:
     return Vec3(triple[0], triple[1], triple[2])
 
 
-def choose(condition: jax.Array | bool, a: Any, b: Any) -> Any:
+def choose(condition: Array | bool, a: Any, b: Any) -> Any:
     """`a` where the condition holds, else `b`, leaf by leaf; known conditions cost nothing."""
     if isinstance(condition, bool):
         return a if condition else b
