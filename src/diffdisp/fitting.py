@@ -876,11 +876,18 @@ def _fit(problem: Problem, target: Picture, prior: str, noise: float | None) -> 
         # So clean a picture shows the light of the paths that were ended early.
         exact = _descend(problem, level, best.z, 0.0, 30, SMALL_STEP)
         best = exact._replace(steps=best.steps + exact.steps)
-    return _result(problem, best, level, prior, noise)
+    known = {"samples": target.samples, "depth": target.depth, "seed": target.seed}
+    own = ", ".join(f"{name} {value}" for name, value in known.items() if value is not None)
+    return _result(problem, best, level, prior, noise, own)
 
 
 def _result(
-    problem: Problem, end: Descent, level: Level, prior: str, given: float | None
+    problem: Problem,
+    end: Descent,
+    level: Level,
+    prior: str,
+    given: float | None,
+    own: str,
 ) -> FitResult:
     """The result in the words of the glass, with its errors."""
     unknowns, lin, film = problem.unknowns, end.lin, problem.film
@@ -929,7 +936,7 @@ def _result(
         n_std=n_std,
         singular_values=singular,
         determined=determined,
-        summary=_summary(waves, n_std, determined, len(singular), source, prior),
+        summary=_summary(waves, n_std, determined, len(singular), source, prior, own),
         rms_residual=lin.rms,
         nearest_glasses=ranked,
         prior=prior,
@@ -1039,7 +1046,13 @@ def _nearest(
 
 
 def _summary(
-    waves: np.ndarray, n_std: np.ndarray, determined: int, free: int, source: str, prior: str
+    waves: np.ndarray,
+    n_std: np.ndarray,
+    determined: int,
+    free: int,
+    source: str,
+    prior: str,
+    own: str,
 ) -> str:
     """What the picture determines, in plain words."""
     known = f"{determined} of the {free} directions of (B, C)"
@@ -1053,4 +1066,6 @@ def _summary(
             " B and C are not determined one by one: over these wavelengths other values of them"
             " give the same n(λ) within its error."
         )
+    if own:
+        text += f" The last level used what the picture says of itself: {own}."
     return text

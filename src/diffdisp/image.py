@@ -173,7 +173,7 @@ def write_picture(path: str | Path, picture: Picture, *, bits: int = 8) -> None:
         ImportError: as `check_output`.
     """
     check_output(path, picture.wavelengths, bits=bits)
-    with _replacing(path) as beside:
+    with replacing(path) as beside:
         match _suffix(path):
             case ".npz":
                 np.savez_compressed(beside, **_fields(picture), allow_pickle=False)
@@ -443,11 +443,14 @@ def _extra_module(name: str | None, path: str | Path) -> Any:
 
 
 @contextlib.contextmanager
-def _replacing(path: str | Path) -> Iterator[Path]:
-    """A name beside `path` to write to, which takes its place once all is written."""
+def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """A name beside `path` to write to, which takes its place once all is written.
+
+    An interrupted run leaves the old file whole and nothing beside it.
+    """
     # Through a link: the file it points to is replaced, not the link.
     target = Path(os.path.realpath(path))
-    beside = target.parent / f".{secrets.token_hex(8)}{_suffix(path)}"
+    beside = target.parent / f".{secrets.token_hex(8)}{Path(path).suffix.lower()}"
     try:
         yield beside
         beside.replace(target)

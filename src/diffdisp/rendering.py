@@ -4,7 +4,7 @@ import itertools
 import os
 import threading
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -216,14 +216,43 @@ def render_pixels(
     progress: Callable[[int, int], None] | None = None,
 ) -> Float[np.ndarray, "chunks pixels channels"]:
     """The pixels of a scene without traced numbers, on all cores."""
-    spectrum, size, scene = film_spectrum(film, plan), film_size(film), without_names(scene)
+    fixed = (plan, without_names(scene), film_spectrum(film, plan), film_size(film))
 
     def run(part: Pixels) -> np.ndarray:
-        return np.asarray(
-            _render_chunks_jit(plan, scene, spectrum, size, part, run_numbers(plan, seed))
-        )
+        return np.asarray(_render_chunks_jit(*fixed, part, run_numbers(plan, seed)))
 
     return over_chunks(run, chunks, plan.dtype, progress)
+
+
+def compile_ahead(scene: Scene, film: Film, *, samples: int, depth: int, dtype: str) -> None:
+    """Compile what `render` would run, without running it; for measuring how long that takes.
+
+    Args:
+        scene: as in `render`, without traced numbers.
+        film: as in `render`.
+        samples: as in `render`.
+        depth: as in `render`.
+        dtype: "float32" or "float64".
+    """
+    plan = make_plan(scene, film, samples, depth, dtype)
+    chunks, _ = all_pixels(film, chunk_pixels(film, plan))
+    fixed = (plan, without_names(scene), film_spectrum(film, plan), film_size(film))
+    with jax.enable_x64(dtype == "float64"):
+        first = next(parts_of(chunks))
+        _render_chunks_jit.lower(*fixed, first, run_numbers(plan, 0)).compile()
+
+
+def parts_of(chunks: Pixels) -> Iterator[Pixels]:
+    """The chunks in parts of equal length, so that one program serves all.
+
+    The last part repeats the last chunk. Few lengths are few programs; a small picture is not
+    worth a long part.
+    """
+    total = len(chunks.x)
+    length = min(CHUNKS_PER_CALL, 1 << (total - 1).bit_length())
+    for start in range(0, total, length):
+        rows = np.minimum(np.arange(start, start + length), total - 1)
+        yield Pixels(chunks.x[rows], chunks.y[rows], chunks.number[rows], chunks.size)
 
 
 def over_chunks(
@@ -232,39 +261,42 @@ def over_chunks(
     dtype: str,
     progress: Callable[[int, int], None] | None = None,
 ) -> np.ndarray:
-    """`run` over parts of equal length, a thread for each core; results joined in order.
+    """`run` over the parts of some chunks, a thread for each core; results joined in order.
 
     XLA's CPU backend keeps to one core what a program does to a few thousand numbers at a time,
-    but threads may run it side by side. Parts are of equal length so that one program serves all.
+    but threads may run it side by side.
     """
-    total = len(chunks.x)
-    # Few lengths are few programs; a small picture is not worth sixteen chunks.
-    length = min(CHUNKS_PER_CALL, 1 << (total - 1).bit_length())
-    starts = list(range(0, total, length))
     stop = threading.Event()
 
-    def part(start: int) -> np.ndarray:
+    def work(part: Pixels) -> np.ndarray:
         if stop.is_set():
             return np.empty(0)
-        rows = np.minimum(np.arange(start, start + length), total - 1)
         # The switch for float64 belongs to a thread, not to the process.
         with jax.enable_x64(dtype == "float64"):
-            return run(Pixels(chunks.x[rows], chunks.y[rows], chunks.number[rows], chunks.size))
+            return run(part)
 
-    workers = (os.cpu_count() or 1) if jax.default_backend() == "cpu" else 1
-    results = []
-    with ThreadPoolExecutor(min(workers, len(starts))) as pool:
+    parts, total, results = list(parts_of(chunks)), len(chunks.x), []
+    with ThreadPoolExecutor(min(_workers(), len(parts))) as pool:
         try:
             # The first alone: two threads at once would compile the same program twice.
-            first = [pool.submit(part, starts[0]).result()]
-            for result in itertools.chain(first, pool.map(part, starts[1:])):
+            first = [pool.submit(work, parts[0]).result()]
+            for result in itertools.chain(first, pool.map(work, parts[1:])):
                 results.append(result)
                 if progress:
-                    progress(min(len(results) * length, total), total)
+                    progress(min(len(results) * len(parts[0].x), total), total)
         except BaseException:
             stop.set()
             raise
     return np.concatenate(results, axis=0)[:total]
+
+
+def _workers() -> int:
+    """Threads that render: a core each; one where another device does the work."""
+    if jax.default_backend() != "cpu":
+        return 1
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 class Spectrum(NamedTuple):

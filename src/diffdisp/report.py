@@ -1,10 +1,8 @@
 """What a fit found: as JSON, as a table, as a page of plots; and a plot of one glass."""
 
-import contextlib
 import json
 import math
 import os
-import secrets
 import textwrap
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,7 +19,7 @@ from diffdisp.color import encode_srgb
 from diffdisp.dispersion import Sellmeier
 from diffdisp.fitting import FitResult
 from diffdisp.glasses import named_glass
-from diffdisp.image import Picture, linear_rgb
+from diffdisp.image import Picture, linear_rgb, replacing
 
 UNDETERMINED = 0.1
 """Relative standard error of a coefficient from which on the picture does not determine it."""
@@ -80,7 +78,7 @@ def fit_json(result: FitResult) -> dict[str, Any]:
 def write_fit_json(path: str | os.PathLike[str], result: FitResult) -> None:
     """Write `fit_json(result)`: beside, then renamed, so that an older file stays whole."""
     text = json.dumps(fit_json(result), indent=2, ensure_ascii=False, allow_nan=False)
-    with _replacing(path) as beside:
+    with replacing(path) as beside:
         beside.write_text(text + "\n", encoding="utf-8")
 
 
@@ -414,17 +412,5 @@ def check_plot_output(path: str | os.PathLike[str]) -> None:
 def _save(figure: Figure, path: str | os.PathLike[str]) -> None:
     """Write a figure beside `path` and rename it."""
     FigureCanvasAgg(figure)
-    with _replacing(path) as beside:
+    with replacing(path) as beside:
         figure.savefig(beside, dpi=120)
-
-
-@contextlib.contextmanager
-def _replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A name beside `path` to write to, which takes its place once all is written."""
-    target = Path(os.path.realpath(path))  # through a link: the file it points to is replaced
-    beside = target.parent / f".{secrets.token_hex(8)}{target.suffix.lower()}"
-    try:
-        yield beside
-        beside.replace(target)
-    finally:
-        beside.unlink(missing_ok=True)

@@ -1,6 +1,5 @@
 """Scene files: TOML to `Scene` and back; every mistake in a file is told at once."""
 
-import contextlib
 import dataclasses
 import json
 import math
@@ -29,6 +28,7 @@ from diffdisp.camera import Camera
 from diffdisp.dispersion import Sellmeier
 from diffdisp.geometry import Plane, Sphere
 from diffdisp.glasses import named_glass
+from diffdisp.image import replacing
 from diffdisp.material import Dielectric, Emitter, Material
 from diffdisp.scene import Background, Object, Scene, pairing_error
 from diffdisp.texture import Checker2D, Solid, Texture
@@ -617,15 +617,11 @@ def save_scene(scene: Scene, path: str | os.PathLike[str]) -> None:
     _, problems = _checked(data)
     if problems:
         raise SceneError([f"{file}: {_message(problem)}" for problem in problems])
-    beside = Path(f"{file}.{os.getpid()}.part")
     try:
-        beside.write_text(_compact(tomli_w.dumps(data)), encoding="utf-8", newline="\n")
-        os.replace(beside, file)
+        with replacing(file) as beside:
+            beside.write_text(_compact(tomli_w.dumps(data)), encoding="utf-8", newline="\n")
     except OSError as error:
         raise SceneError([f"{file}: cannot be written: {_reason(error)}"]) from error
-    finally:
-        with contextlib.suppress(OSError):
-            beside.unlink()
 
 
 def _compact(toml: str) -> str:
