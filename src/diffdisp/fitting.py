@@ -84,6 +84,10 @@ CUTOFF = 1e-4
 NEGLECTED = 3e-3
 """Change of the fitted index over `CUTOFF`: 3e-4 to 2e-3 measured on the bench of N-BK7."""
 
+LINEAR_STEP = 3.0
+"""A step that changes the picture by less than this many times its noise is so nearly linear that
+the next one is far below a tenth of the noise: 2.5 times, then 0.06 measured on the bench."""
+
 SMALL_STEP = 0.1
 """A step that changes the picture by less than this part of its noise ends the fit."""
 
@@ -316,7 +320,7 @@ class Linearised(NamedTuple):
         noise: root mean square of those.
         rms: root mean square of all residuals.
         explained: part of the variance of what depends on the index that the render explains.
-        weight: (blocks, channels) how much the index changes the picture.
+        slopes: (blocks, t, channels) change of the render along each tangent.
         picture: (blocks, channels) the render.
     """
 
@@ -328,8 +332,22 @@ class Linearised(NamedTuple):
     noise: float
     rms: float
     explained: float
-    weight: np.ndarray
+    slopes: np.ndarray
     picture: np.ndarray
+
+    @property
+    def weight(self) -> np.ndarray:
+        """How much the index changes the picture (blocks, channels)."""
+        return np.max(np.abs(self.slopes), axis=1)
+
+    def moved(self, change: np.ndarray) -> "Linearised":
+        """The same after a change (m,) of the index, as far as the picture is linear in it."""
+        bands = self.slopes.shape[1] == 1
+        shift = self.slopes[:, 0] * change if bands else np.tensordot(change, self.slopes, (0, 1))
+        q = self.q + self.r @ change
+        cost = self.cost + float(np.sum(q**2) - np.sum(self.q**2))
+        rms = self.rms * np.sqrt(cost / self.cost) if self.cost > 0 else 0.0
+        return self._replace(q=q, cost=cost, rms=float(rms), picture=self.picture + shift)
 
 
 def fit(
@@ -545,7 +563,6 @@ def _linearise(problem: Problem, level: Level, z: np.ndarray, cutoff: float) -> 
     picture, slopes = joined[:, 0], joined[:, 1:]
     residual = picture - level.target
     seen = np.any(slopes != 0, axis=1)
-    weight = np.max(np.abs(slopes), axis=1)
     cost, m = float(np.sum(residual**2)), len(problem.unknowns.project)
     if problem.film.wavelengths is None:
         rows = np.moveaxis(slopes, 1, -1).reshape(-1, m)
@@ -563,7 +580,7 @@ def _linearise(problem: Problem, level: Level, z: np.ndarray, cutoff: float) -> 
     rms = np.sqrt(np.mean(residual**2))
     contrast = np.sum((level.target[seen] - np.mean(level.target[seen])) ** 2) if count else 1.0
     explained = 1 - float(np.sum(residual[seen] ** 2)) / max(float(contrast), 1e-300)
-    return Linearised(r, q, meat, cost, count, float(noise), float(rms), explained, weight, picture)
+    return Linearised(r, q, meat, cost, count, float(noise), float(rms), explained, slopes, picture)
 
 
 class Step(NamedTuple):
@@ -696,8 +713,8 @@ def _descend(
         largest = np.max(np.abs(unknowns.coefficients.index(new, unknowns.reference) - index))
         visible = np.linalg.norm(lin.r @ change)
         if largest < LEAST_CHANGE or visible < small * lin.noise:
-            # So near the next picture would be the same: it need not be traced.
-            z, converged = new, True
+            # So near the picture is linear: it need not be traced again.
+            z, lin, converged = new, lin.moved(change), True
             break
         tried = _linearise(problem, level, new, cutoff)
         steps += 1
@@ -718,8 +735,8 @@ def _n_d(unknowns: Unknowns, z: np.ndarray) -> float:
     return float(unknowns.coefficients.index(z, np.array([LINE_D]))[0])
 
 
-def _refined(problem: Problem, level: Level, descent: Descent) -> Level:
-    """A whole picture with the samples of `SAMPLES`: more of them where they matter.
+def _refined(problem: Problem, few: Descent, depth: int, seed: int) -> tuple[Level, np.ndarray]:
+    """A whole picture with the samples of `SAMPLES`, and the coordinates (free,) to go on from.
 
     Near the rim a ball shows the whole scene within a few pixels, where footprints are neither
     small nor straight. The pixels that weigh most in the index and change most with the samples
@@ -728,25 +745,25 @@ def _refined(problem: Problem, level: Level, descent: Descent) -> Level:
 
     Args:
         problem: what stays the same.
-        level: a whole picture of few samples.
-        descent: where its steps ended.
+        few: where the steps on a whole picture of few samples ended.
+        depth: segments of a path.
+        seed: of the renders.
 
     Source:
         Richardson, Phil. Trans. A 210 (1911) 307, extrapolation to a step of zero.
     """
-    depth, rows = level.parts[0].plan.depth, np.arange(len(level.target))
-    some = _part(problem, 1, SAMPLES[0], depth, rows, 1.0)
-    more = _trace(problem, some, descent.z, level.seed, CUTOFF)
-    change = np.abs(more[:, 0] - descent.lin.picture) * descent.lin.weight
-    order = np.argsort(-np.max(change, axis=1))
-    hard = np.zeros(len(order), bool)
-    hard[order[: int(np.sum(descent.lin.weight.any(axis=1)) * REFINED)]] = True
+    level = _level(problem, 1, SAMPLES[0], depth, seed)
+    some = _linearise(problem, level, few.z, CUTOFF)
+    change = np.max(np.abs(some.picture - few.lin.picture) * some.weight, axis=1)
+    hard = np.zeros(len(change), bool)
+    hard[np.argsort(-change)[: int(np.sum(some.weight.any(axis=1)) * REFINED)]] = True
     parts = (
         _part(problem, 1, SAMPLES[0], depth, np.flatnonzero(~hard), 1.0),
         _part(problem, 1, SAMPLES[0], depth, np.flatnonzero(hard), -1 / 3),
         _part(problem, 1, SAMPLES[1], depth, np.flatnonzero(hard), 4 / 3),
     )
-    return level._replace(parts=tuple(part for part in parts if len(part.rows)))
+    z = _next_z(problem.unknowns, few.z, few.z, some, 0.0)
+    return level._replace(parts=tuple(part for part in parts if len(part.rows))), z
 
 
 def _starts(problem: Problem, level: Level, most: int) -> list[np.ndarray]:
@@ -867,10 +884,10 @@ def _fit(problem: Problem, target: Picture, prior: str, noise: float | None) -> 
     if target.samples is None:
         level = _level(problem, 1, FEW_SAMPLES, depth, seed)
         best = _descend(problem, level, best.z, CUTOFF, 20, 1.0)
-        level = _refined(problem, level, best)
+        level, z = _refined(problem, best, depth, seed)
     else:
-        level = _level(problem, 1, target.samples, depth, seed)
-    best = _descend(problem, level, best.z, CUTOFF, 30, SMALL_STEP)
+        level, z = _level(problem, 1, target.samples, depth, seed), best.z
+    best = _descend(problem, level, z, CUTOFF, 30, LINEAR_STEP)
     error = best.lin.noise / max(float(np.max(np.abs(best.lin.r))), 1e-300)
     if NEGLECTED * CUTOFF > SMALL_STEP * error:
         # So clean a picture shows the light of the paths that were ended early.
