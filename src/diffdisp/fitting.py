@@ -91,8 +91,9 @@ the next one is far below a tenth of the noise: 2.5 times, then 0.06 measured on
 SMALL_STEP = 0.1
 """A step that changes the picture by less than this part of its noise ends the fit."""
 
-LEAST_CHANGE = 1e-13
-"""Changes of n below this are rounding."""
+LEAST_CHANGE = (1e-13, 1e-9)
+"""Changes of n below this are rounding; and for colour, whose slopes are along six polynomials and
+so not quite those of a glass, as little as steps can still tell."""
 
 PRIORS = ("none", "catalogue", "fixed-c3")
 
@@ -211,7 +212,7 @@ class Coefficients(eqx.Module):
         zero = (B == 0)[None, :]
         terms = jnp.where(zero, 0.0, B[None] * squared / jnp.where(zero, 1.0, squared - C[None]))
         n_squared = 1 + jnp.sum(terms, axis=-1)
-        low = 0.25 * jnp.exp(jnp.minimum(n_squared / 0.25 - 1, 0.0))
+        low = 0.25 / (1 - jnp.minimum(n_squared / 0.25 - 1, 0.0))
         return jnp.sqrt(jnp.where(n_squared > 0.25, n_squared, low))
 
     def logarithms(self, z: Array) -> jax.Array:
@@ -703,6 +704,7 @@ def _descend(
         small: a step that changes the picture by less than this part of its noise is the last.
     """
     unknowns = problem.unknowns
+    least = LEAST_CHANGE[0] if problem.film.wavelengths is not None else LEAST_CHANGE[1]
     lin, damping, converged = _linearise(problem, level, z, cutoff), 0.0, False
     steps, anchor = 1, z
     while steps < most and not converged:
@@ -712,7 +714,7 @@ def _descend(
         change = np.asarray(unknowns.change(new, index))
         largest = np.max(np.abs(unknowns.coefficients.index(new, unknowns.reference) - index))
         visible = np.linalg.norm(lin.r @ change)
-        if largest < LEAST_CHANGE or visible < small * lin.noise:
+        if largest < least or visible < small * lin.noise:
             # So near the picture is linear: it need not be traced again.
             z, lin, converged = new, lin.moved(change), True
             break
@@ -724,7 +726,7 @@ def _descend(
         )
         if after <= before:
             z, lin, damping = new, tried, damping / 10 if damping > 1e-2 else 0.0
-        elif largest < 100 * LEAST_CHANGE:
+        elif largest < 100 * least:
             converged = True  # what is left of the residual is rounding
         else:
             damping = max(10 * damping, 1.0)
