@@ -57,9 +57,13 @@ INDEX_GRID = np.geomspace(1.2, 2.7, 128)
 COARSE_PIXELS = 32
 """Blocks along the longer side of the coarsest picture."""
 
-SAMPLES = (16, 64)
-"""Film samples per pixel of the last level, where the target does not say its own: of most pixels,
-and of those that more samples change most."""
+FEW_SAMPLES = 4
+"""Film samples per pixel on the way to the last level."""
+
+SPLITS = (2, 4)
+"""Into how many parts each way the last level splits a pixel, where the target does not say its own
+samples: most pixels, and those that more samples change most. With `FEW_SAMPLES` in each part that
+is 16 and 64 samples a pixel, by one program."""
 
 REFINED = 0.3
 """Part of the pixels that show the ball that get the more samples."""
@@ -74,9 +78,6 @@ running away and bounds the errors reported; next to anything that a picture tel
 
 CLEAN = 1e-5
 """A residual below this part of the brightest value is no noise of a camera."""
-
-FEW_SAMPLES = 4
-"""Film samples per pixel on the way there."""
 
 CUTOFF = 1e-4
 """Part of its light with which a path ends; 0 in the last steps on a picture without noise."""
@@ -280,8 +281,10 @@ class Part(NamedTuple):
         plan: static choices of the render.
         spectrum: the film's.
         chunks: the blocks.
-        place: (blocks,) where each one stands among the chunks' pixels.
+        place: (blocks, split²) where each one's parts stand among the chunks' pixels.
         rows: (blocks,) their rows in the level's target.
+        split: each block is rendered as split² smaller ones, and they are averaged:
+            more samples by the same program.
         share: weight of this render in the sum that those blocks' picture is.
         tangents: (t, *wavelengths) changes of n along which the picture is differentiated.
     """
@@ -291,6 +294,7 @@ class Part(NamedTuple):
     chunks: Pixels
     place: np.ndarray
     rows: np.ndarray
+    split: int
     share: float
     tangents: np.ndarray
 
@@ -472,29 +476,45 @@ def _by_C(C: Array) -> np.ndarray:
     return np.concatenate([order, order + 3])
 
 
-def _level(problem: Problem, size: int, samples: int, depth: int, seed: int) -> Level:
-    """The problem in blocks of `size` pixels; what fills no block at the border is left out."""
+def _level(
+    problem: Problem, size: int, samples: int, depth: int, seed: int, split: int = 1
+) -> Level:
+    """The problem in blocks of `size` pixels, each with `samples` · `split`² samples.
+
+    What fills no block at the border is left out.
+    """
     film, target = problem.film, problem.target
     width, height = film.width // size, film.height // size
     cut = target[: height * size, : width * size]
     means = cut.reshape(height, size, width, size, -1).mean((1, 3)).reshape(height * width, -1)
-    part = _part(problem, size, samples, depth, np.arange(height * width), 1.0)
+    part = _part(problem, size, samples, depth, np.arange(height * width), split)
     return Level((part,), means, seed)
 
 
 def _part(
-    problem: Problem, size: int, samples: int, depth: int, rows: np.ndarray, share: float
+    problem: Problem,
+    size: int,
+    samples: int,
+    depth: int,
+    rows: np.ndarray,
+    split: int = 1,
+    share: float = 1.0,
 ) -> Part:
-    """The blocks of `size` pixels with numbers `rows`, at `samples` samples."""
+    """The blocks of `size` pixels with numbers `rows`, at `samples` · `split`² samples."""
     film = problem.film
     plan = replace(make_plan(problem.scene, film, samples, depth, "float64"), dispersive=True)
     spectrum = film_spectrum(film, plan)
-    chunks, place = some_blocks(rows, film.width // size, size, chunk_pixels(film, plan))
+    width = film.width // size
+    y, x = np.divmod(rows[:, None], width)
+    down, right = np.divmod(np.arange(split**2), split)
+    numbers = (y * split + down) * (width * split) + x * split + right
+    count = chunk_pixels(film, plan)
+    chunks, place = some_blocks(numbers.ravel(), width * split, size / split, count)
     if film.wavelengths is None:
         tangents = _polynomials(np.asarray(spectrum.wavelengths))
     else:
         tangents = np.ones((1, film.channels))
-    return Part(plan, spectrum, chunks, place, rows, share, tangents)
+    return Part(plan, spectrum, chunks, place.reshape(numbers.shape), rows, split, share, tangents)
 
 
 def _traced(
@@ -552,7 +572,7 @@ def _trace(
         return np.asarray(_traced_jit(part.plan, problem.ball, *fixed))
 
     values = over_chunks(trace, part.chunks, "float64")
-    return values.reshape(-1, *values.shape[2:])[part.place]
+    return np.mean(values.reshape(-1, *values.shape[2:])[part.place], axis=1)
 
 
 def _linearise(problem: Problem, level: Level, z: np.ndarray, cutoff: float) -> Linearised:
@@ -738,7 +758,7 @@ def _n_d(unknowns: Unknowns, z: np.ndarray) -> float:
 
 
 def _refined(problem: Problem, few: Descent, depth: int, seed: int) -> tuple[Level, np.ndarray]:
-    """A whole picture with the samples of `SAMPLES`, and the coordinates (free,) to go on from.
+    """A whole picture with samples as `SPLITS` says, and the coordinates (free,) to go on from.
 
     Near the rim a ball shows the whole scene within a few pixels, where footprints are neither
     small nor straight. The pixels that weigh most in the index and change most with the samples
@@ -754,18 +774,22 @@ def _refined(problem: Problem, few: Descent, depth: int, seed: int) -> tuple[Lev
     Source:
         Richardson, Phil. Trans. A 210 (1911) 307, extrapolation to a step of zero.
     """
-    level = _level(problem, 1, SAMPLES[0], depth, seed)
+    level = _level(problem, 1, FEW_SAMPLES, depth, seed, SPLITS[0])
     some = _linearise(problem, level, few.z, CUTOFF)
     change = np.max(np.abs(some.picture - few.lin.picture) * some.weight, axis=1)
     hard = np.zeros(len(change), bool)
     hard[np.argsort(-change)[: int(np.sum(some.weight.any(axis=1)) * REFINED)]] = True
-    parts = (
-        _part(problem, 1, SAMPLES[0], depth, np.flatnonzero(~hard), 1.0),
-        _part(problem, 1, SAMPLES[0], depth, np.flatnonzero(hard), -1 / 3),
-        _part(problem, 1, SAMPLES[1], depth, np.flatnonzero(hard), 4 / 3),
+    parts = tuple(
+        _part(problem, 1, FEW_SAMPLES, depth, np.flatnonzero(which), split, share)
+        for which, split, share in (
+            (~hard, SPLITS[0], 1.0),
+            (hard, SPLITS[0], -1 / 3),
+            (hard, SPLITS[1], 4 / 3),
+        )
+        if which.any()
     )
     z = _next_z(problem.unknowns, few.z, few.z, some, 0.0)
-    return level._replace(parts=tuple(part for part in parts if len(part.rows))), z
+    return level._replace(parts=parts), z
 
 
 def _starts(problem: Problem, level: Level, most: int) -> list[np.ndarray]:
@@ -960,7 +984,7 @@ def _result(
         nearest_glasses=ranked,
         prior=prior,
         noise=given,
-        samples=tuple(part.plan.samples for part in level.parts),
+        samples=tuple(part.plan.samples * part.split**2 for part in level.parts),
         picture=lin.picture.reshape(problem.target.shape),
     )
 

@@ -482,8 +482,7 @@ def _lane_radiance_jvp(
     plan: Plan, primals: tuple[Any, Any], tangents: tuple[Any, Any]
 ) -> tuple[Any, Any]:
     indices, lanes = primals
-    radiance = lane_radiance(plan, indices, lanes)
-    tangent = jnp.zeros_like(radiance)
+    slopes, radiance = [], None
     for ball, change in enumerate(tangents[0]):
         if isinstance(change, SymbolicZero):
             continue
@@ -494,16 +493,18 @@ def _lane_radiance_jvp(
 
         index = indices[ball]
         radiance, slope = jax.jvp(of_index, (index,), (jnp.ones_like(index),))
-        tangent = tangent + slope * change.reshape(change.shape + (1,) * (4 - change.ndim))
+        slopes.append(slope * change.reshape(change.shape + (1,) * (4 - change.ndim)))
     if not all(isinstance(t, SymbolicZero) for t in jax.tree.leaves(tangents[1], is_leaf=_zero)):
         changes = jax.tree.map(_instantiate, tangents[1], lanes, is_leaf=_zero)
-        _, change = jax.jvp(
+        radiance, slope = jax.jvp(
             lambda lanes: _radiance(plan, indices, lanes._replace(one=None), _bounded),
             (lanes,),
             (changes,),
         )
-        tangent = tangent + change
-    return radiance, tangent
+        slopes.append(slope)
+    if radiance is None:
+        radiance = lane_radiance(plan, indices, lanes)
+    return radiance, sum(slopes, jnp.zeros_like(radiance))
 
 
 def _zero(leaf: object) -> bool:

@@ -172,11 +172,11 @@ def all_pixels(film: Film, count: int) -> tuple[Pixels, np.ndarray]:
         The pixels, and for each pixel of the picture, row by row, its place among them. The last
         chunk repeats its last pixel to be as long as the others.
     """
-    return some_blocks(np.arange(film.width * film.height), film.width, 1, count)
+    return some_blocks(np.arange(film.width * film.height), film.width, 1.0, count)
 
 
 def some_blocks(
-    numbers: np.ndarray, width: int, size: int, count: int
+    numbers: np.ndarray, width: int, size: float, count: int
 ) -> tuple[Pixels, np.ndarray]:
     """Square blocks of `size` pixels by their numbers, row by row of `width` blocks.
 
@@ -200,10 +200,10 @@ def some_blocks(
     order = np.append(order, np.repeat(order[-1], chunks * count - len(order)))
     order = order.reshape(chunks, count)
     return Pixels(
-        x[order] * float(size),
-        y[order] * float(size),
+        x[order] * size,
+        y[order] * size,
         numbers[order].astype(np.uint32),
-        np.asarray(float(size)),
+        np.asarray(size),
     ), place
 
 
