@@ -831,7 +831,7 @@ def _index_table(problem: Problem, level: Level) -> np.ndarray:
     spectrum = Spectrum(np.full(len(INDEX_GRID), middle), None, None)
     size, run = film_size(problem.film), run_numbers(plan, level.seed, 1e-3)
     edge = int(part.chunks.size)
-    chunks, place = some_blocks(part.rows, problem.film.width // edge, edge, 4)
+    chunks, place = some_blocks(part.rows, problem.film.width // edge, float(edge), 4)
 
     def trace(chunks: Pixels) -> np.ndarray:
         return np.asarray(

@@ -245,13 +245,11 @@ def compile_ahead(scene: Scene, film: Film, *, samples: int, depth: int, dtype: 
 def parts_of(chunks: Pixels) -> Iterator[Pixels]:
     """The chunks in parts of equal length, so that one program serves all.
 
-    The last part repeats the last chunk. Few lengths are few programs; a small picture is not
-    worth a long part.
+    The last part repeats the last chunk.
     """
     total = len(chunks.x)
-    length = min(CHUNKS_PER_CALL, 1 << (total - 1).bit_length())
-    for start in range(0, total, length):
-        rows = np.minimum(np.arange(start, start + length), total - 1)
+    for start in range(0, total, CHUNKS_PER_CALL):
+        rows = np.minimum(np.arange(start, start + CHUNKS_PER_CALL), total - 1)
         yield Pixels(chunks.x[rows], chunks.y[rows], chunks.number[rows], chunks.size)
 
 
