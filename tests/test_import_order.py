@@ -23,6 +23,8 @@ ORDER = (
     "sampling",
     "planning",
     "integrator",
+    "chunks",
+    "wavefront",
     "rendering",
     "fitting",
     "scene_file",

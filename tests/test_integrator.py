@@ -12,7 +12,7 @@ from diffdisp.film import Film
 from diffdisp.fresnel import cos_transmitted, fresnel_reflectance
 from diffdisp.geometry import Ray
 from diffdisp.glasses import named_glass
-from diffdisp.integrator import Path, bounce, emission_table, once, world_tables
+from diffdisp.integrator import Path, Setting, Tables, bounce, once, paint_table, world_tables
 from diffdisp.planning import Plan, make_plan
 from diffdisp.scene import Scene
 from diffdisp.vector import Vec3, vec3
@@ -33,19 +33,16 @@ class Bench(NamedTuple):
         """One bounce; every ball but the first has index 1."""
         one = jnp.ones(())
         indices = jnp.stack([jnp.asarray(n), *[one] * (self.plan.balls - 1)])
-        world, emission = world_tables(self.scene), emission_table(self.scene)
-        inside = path.last == path.ball if inside is None else inside
-        return bounce(
-            path=path,
-            branch=lambda bounces: jnp.asarray(chooses),
-            indices=indices,
-            world=world,
-            emission=emission,
+        setting = Setting(
+            tables=Tables(world_tables(self.scene), paint_table(self.scene)),
             plan=self.plan,
-            inside=inside,
+            draw=lambda bounces, decision: jnp.asarray(chooses),
+            index=lambda ball: indices[ball],
+            weights=None,
             cutoff=jnp.zeros(()),
             one=None,
         )
+        return bounce(path, setting, inside)
 
 
 def tracer_bench(*objects, depth=50):
@@ -67,12 +64,13 @@ def path_at(impact):
     return Path(
         ray=Ray(origin, vec3(jnp.array([0, 0, -1.0]))),
         footprint=(Ray(still, still), Ray(still, still)),
-        ball=jnp.array(0, jnp.int32),
+        surface=jnp.array(0, jnp.int32),
         last=jnp.array(-1, jnp.int32),
-        throughput=jnp.ones(()),
-        radiance=jnp.zeros(3),
+        throughput=(jnp.ones(()),),
+        radiance=(jnp.zeros(()),) * 3,
         bounces=jnp.array(0, jnp.int32),
         alive=jnp.array(True),
+        spectral=None,
     )
 
 
@@ -82,7 +80,7 @@ def leave(impact, n, order):
     inner = path_at(impact)
     inner = jax.lax.fori_loop(0, order + 1, lambda _, p: SURROUNDED.bounce(p, n, 1 - 1e-12), inner)
     outer = SURROUNDED.bounce(inner, n, 0.0)
-    return outer.ray, outer.ball
+    return outer.ray, outer.surface
 
 
 @jax.jit
@@ -204,7 +202,7 @@ def test_weights_of_the_orders(impact):
     np.testing.assert_allclose(
         light, [R, *(1 - R) ** 2 * powers[:4]], rtol=0, atol=1e-12
     )  # rounding
-    throughput = [path.throughput for path in paths]
+    throughput = [path.throughput[0] for path in paths]
     np.testing.assert_allclose(throughput, (1 - R) * powers, rtol=0, atol=1e-12)
     np.testing.assert_allclose(light.sum() + throughput[-1], 1, rtol=0, atol=1e-12)
     assert [int(path.bounces) for path in paths] == [1, 2, 3, 4, 5]

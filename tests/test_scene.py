@@ -6,9 +6,18 @@ from helpers import AIR, BK7, ball, bench, camera, lamp, screen
 from diffdisp.dispersion import Sellmeier
 from diffdisp.geometry import Plane, Sphere
 from diffdisp.glasses import named_glass
-from diffdisp.material import Dielectric, Emitter
-from diffdisp.scene import Object, Scene, glass_names, is_glass, object_glass, with_glass
-from diffdisp.texture import Checker2D
+from diffdisp.material import Dielectric, Emitter, Lambertian, Metal
+from diffdisp.scene import (
+    Object,
+    Scene,
+    glass_names,
+    is_glass,
+    object_glass,
+    texture_of,
+    with_glass,
+    without_names,
+)
+from diffdisp.texture import Checker, Checker2D, Solid
 
 CHECKER = Checker2D([1.0] * 3, [0.0] * 3, 0.5)
 
@@ -30,11 +39,26 @@ def test_numbers_are_no_structure():
     [
         (Plane([0, 0, 0], [0, 0, 1]), Dielectric(AIR), "plane cannot be glass"),
         (Sphere([0, 0, 0], 1), Emitter(CHECKER), "sphere cannot carry a checker2d"),
+        (Sphere([0, 0, 0], 1), Lambertian(CHECKER), "sphere cannot carry a checker2d"),
+        (Sphere([0, 0, 0], 1), Metal(CHECKER), "sphere cannot carry a checker2d"),
     ],
 )
 def test_pairs_that_mean_nothing_are_refused(shape, material, message):
     with pytest.raises(ValueError, match=message):
         Object(shape, material)
+
+
+@pytest.mark.parametrize("material", [Lambertian, Metal, Emitter])
+def test_other_pairs_are_scenes(material):
+    cubes = Checker([1.0] * 3, [0.0] * 3)
+    for shape, texture in [
+        (Plane([0, 0, 0], [0, 0, 1]), CHECKER),
+        (Plane([0, 0, 0], [0, 0, 1]), cubes),
+        (Sphere([0, 0, 0], 1), cubes),
+        (Sphere([0, 0, 0], 1), Solid([1.0, 0.5, 0.0])),
+    ]:
+        assert texture_of(Object(shape, material(texture)).material) is texture
+    assert texture_of(Dielectric(AIR)) is None
 
 
 def test_a_named_glass_is_looked_up():
@@ -66,3 +90,12 @@ def test_exchanging_the_glass_leaves_the_rest():
 def test_defaults():
     np.testing.assert_array_equal(Scene(camera(), ()).background.color, 0)
     assert lamp((0, 0, 0), 1).material.intensity == 1
+    assert Metal([1, 1, 1]).fuzz == 0
+    assert Checker([1, 1, 1], [0, 0, 0]).scale == 10
+
+
+def test_without_names_a_surface_is_the_same():
+    matte = Object(Sphere([0, 0, 0], 1), Lambertian([1, 1, 1]), "ground")
+    (nameless,) = without_names(Scene(camera(), [matte])).objects
+    assert nameless.name == ""
+    assert nameless.material is matte.material

@@ -15,10 +15,10 @@ from diffdisp.camera import Camera
 from diffdisp.dispersion import Sellmeier
 from diffdisp.geometry import Plane, Sphere
 from diffdisp.glasses import named_glass
-from diffdisp.material import Dielectric, Emitter
+from diffdisp.material import Dielectric, Emitter, Lambertian, Metal
 from diffdisp.scene import Background, Object, Scene
 from diffdisp.scene_file import SceneError, load_scene, save_scene, scene_from_toml, scene_schema
-from diffdisp.texture import Checker2D, Solid
+from diffdisp.texture import Checker, Checker2D, Solid
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
 SAMPLES = [*sorted((FIXTURES / "scenes").glob("*.toml")), FIXTURES / "targets" / "ball_nbk7.toml"]
@@ -109,6 +109,25 @@ def test_jax_arrays_are_saved(tmp_path):
     assert load_scene(tmp_path / "s.toml").objects[0].shape.radius == 2.0
 
 
+@pytest.mark.parametrize(
+    "texture",
+    [
+        Solid([0.2, 1 / 3, 1]),
+        Checker([0, 0, 0], [1, 1, 1]),
+        Checker([0, 0.1, 0], [1, 1, 1], 1 / 3),
+        Checker2D([0, 0, 0.5], [1, 1, 1], 1 / 3),
+    ],
+)
+def test_every_surface_survives_saving(texture, tmp_path):
+    shapes = [Plane([0, 0, 0], [0, 1, 0]), Sphere([0, 0, 0], 1.0)]
+    if isinstance(texture, Checker2D):
+        shapes.pop()
+    materials = [Lambertian(texture), Metal(texture), Metal(texture, 1 / 3), Emitter(texture, 1e9)]
+    objects = tuple(Object(shape, material) for shape in shapes for material in materials)
+    save_scene(Scene(Camera([0, 0, 4], [0, 0, 0]), objects), tmp_path / "s.toml")
+    assert eqx.tree_equal(load_scene(tmp_path / "s.toml").objects, objects)
+
+
 def test_triples_are_saved_on_one_line(tmp_path):
     save_scene(scene_from_toml(GOOD), tmp_path / "s.toml")
     saved = (tmp_path / "s.toml").read_text(encoding="utf-8")
@@ -133,6 +152,30 @@ def test_a_scene_may_be_empty(tmp_path):
     assert scene.objects == ()
     save_scene(scene, tmp_path / "empty.toml")
     assert eqx.tree_equal(load_scene(tmp_path / "empty.toml"), scene)
+
+
+def test_defaults_of_surfaces():
+    ground = (
+        f'{CAMERA}[[object]]\nshape = {{type = "plane", point = [0, 1, 0], normal = [0, 1, 0]}}\n'
+    )
+    checker = '{type = "checker", even = [0, 0, 0], odd = [1, 1, 1]}'
+    (matte,) = scene_from_toml(
+        f'{ground}material = {{type = "lambertian", texture = {checker}}}'
+    ).objects
+    (metal,) = scene_from_toml(
+        f'{ground}material = {{type = "metal", texture = [1, 0.5, 0]}}'
+    ).objects
+    assert eqx.tree_equal(matte.material, Lambertian(Checker([0, 0, 0], [1, 1, 1], 10.0)))
+    assert eqx.tree_equal(metal.material, Metal(Solid([1, 0.5, 0]), 0.0))
+
+
+def test_only_a_lamp_may_be_brighter_than_white():
+    texture = '{type = "checker", even = [2, 3, 4], odd = [0, 0, 0], scale = 20}'
+    text = f'{CAMERA}[[object]]\n{BALL % 1}\nmaterial = {{type = "emitter", texture = {texture}}}'
+    (lamp,) = scene_from_toml(text).objects
+    assert eqx.tree_equal(lamp.material, Emitter(Checker([2, 3, 4], [0, 0, 0], 20.0)))
+    with pytest.raises(SceneError, match=r"texture\.even\[2\]: found 4; allowed: .* from 0 to 1"):
+        scene_from_toml(text.replace("emitter", "lambertian"))
 
 
 def test_all_kinds_are_read():
@@ -201,13 +244,13 @@ BAD = [
     (10, BALL % "true", "object[0].shape.radius", 10, "found true; allowed: a finite number"),
     (10, BALL % ("0x" + 400 * "f"), "object[0].shape.radius", 10, "an integer of 1600 bits"),
     (10, BALL % "1, fuzz = 1", "object[0].shape.fuzz", 10, "allowed: type, center, radius"),
-    (11, "", "object[0].material", 8, "one of dielectric, emitter"),
+    (11, "", "object[0].material", 8, "one of lambertian, metal, dielectric, emitter"),
     (
         11,
-        'material.type = "metal"',
+        'material.type = "velvet"',
         "object[0].material.type",
         11,
-        "allowed: dielectric or emitter",
+        'found "velvet"; allowed: lambertian, metal, dielectric or emitter',
     ),
     (
         11,
@@ -217,7 +260,7 @@ BAD = [
         "missing; required: the name of a glass",
     ),
     (11, GLASS % 'glass = "N-BK8"', "object[0].material.glass", 11, "similar are N-BK7"),
-    (11, "material.type='glass by name'", "object[0].material.type", 11, "allowed: dielectric or"),
+    (11, "material.type='glass by name'", "object[0].material.type", 11, "allowed: lambertian"),
     (11, GLASS % "glass = 7", "object[0].material.glass", 11, "found 7; allowed: the name"),
     (11, GLASS % "B = [1, 1, 1]", "object[0].material.C", 11, "missing; required: three finite"),
     (11, GLASS % "C = [1, 1, 1]", "object[0].material.B", 11, "missing; required: three finite"),
@@ -249,9 +292,23 @@ BAD = [
         "found [0, 0, 0]; allowed: three numbers, not all zero",
     ),
     (14, BALL % 1, "object[1].material", 15, "a sphere cannot carry a checker2d"),
-    (16, 'type = "lambertian"', "object[1].material.type", 16, '"lambertian"; allowed: dielectric'),
+    (16, 'type = "wax"', "object[1].material.type", 16, 'found "wax"; allowed: lambertian, metal'),
+    (16, 'type = "metal"', "object[1].material.intensity", 17, "allowed: type, texture, fuzz"),
     (17, "intensity = -1", "object[1].material.intensity", 17, "found -1; allowed: a finite"),
-    (19, 'type = "checker"', "object[1].material.texture.type", 19, "allowed: solid or checker2d"),
+    (
+        19,
+        'type = "marble"',
+        "object[1].material.texture.type",
+        19,
+        'found "marble"; allowed: solid, checker or checker2d',
+    ),
+    (
+        19,
+        'type="checker"',
+        "object[1].material.texture.tile",
+        22,
+        "allowed: type, even, odd, scale",
+    ),
     (20, "even = [1, 1, -1]", "object[1].material.texture.even[2]", 20, "found -1"),
     (21, "", "object[1].material.texture.odd", 18, "missing; required: three finite numbers ≥ 0"),
     (
@@ -289,6 +346,71 @@ def test_a_bad_texture_is_told(texture, path, phrase):
     material = f'material = {{ type = "emitter", texture = {texture} }}'
     (found,) = problems(f"{CAMERA}[[object]]\n{shape}\n{material}\n")
     assert found.startswith(f"bad.toml:6: object[0].material.{path}: {phrase}")
+
+
+COLOR = "three finite numbers ≥ 0"
+ALBEDO = "three finite numbers from 0 to 1"
+MATTE = 'type = "lambertian", texture = %s'
+METAL = 'type = "metal", texture = [1, 1, 1]'
+CHECKER = '{ type = "checker", even = [0, 0, 0], odd = [1, 1, 1]%s }'
+
+
+@pytest.mark.parametrize(
+    ("material", "told"),
+    [
+        ('type = "lambertian"', [f"texture: missing; required: {ALBEDO}, or a table"]),
+        ('type = "metal"', [f"texture: missing; required: {ALBEDO}, or a table"]),
+        ('type = "emitter"', [f"texture: missing; required: {COLOR}, or a table"]),
+        (MATTE % "true", [f"texture: found true; allowed: {ALBEDO}, or a table whose type is one"]),
+        (MATTE % '"red"', ['texture: found "red"; allowed: three']),
+        (MATTE % "[1, 2]", [f"texture: found [1, 2]; allowed: {ALBEDO}"]),
+        (MATTE % "[1, nan, -1]", [f"texture[{i}]: found {x}; allowed: {ALBEDO}" for i, x in
+                                  [(1, "nan"), (2, "-1")]]),
+        (MATTE % "[inf, 0, 0]", [f"texture[0]: found inf; allowed: {ALBEDO}"]),
+        (MATTE % f"[0x{400 * 'f'}, 0, 0]", ["texture[0]: found an integer of 1600 bits; allowed:"]),
+        (MATTE % "[true, 0, 0]", ["texture[0]: found true; allowed: "]),
+        (MATTE % '[1, "0.5", 1]', ['texture[1]: found "0.5"; allowed: ']),
+        (MATTE % "[0, 0, 1.5]", [f"texture[2]: found 1.5; allowed: {ALBEDO}"]),
+        (MATTE % "[1, 1, 1], fuzz = 0", ["fuzz: unknown field; allowed: type, texture"]),
+        (MATTE % '{ type = "solid", color = [0, 2, 0] }',
+         [f"texture.color[1]: found 2; allowed: {ALBEDO}"]),
+        (MATTE % '{ type = "solid", color = [0, -2, 0] }',
+         [f"texture.color[1]: found -2; allowed: {ALBEDO}"]),
+        (MATTE % '{ type = "checker", even = [1, 1, 7], odd = [1.1, 0, 0], scale = 0 }',
+         ["texture.scale: found 0; allowed: a finite number > 0",
+          f"texture.even[2]: found 7; allowed: {ALBEDO}",
+          f"texture.odd[0]: found 1.1; allowed: {ALBEDO}"]),
+        (MATTE % CHECKER % ", scale = -10", ["texture.scale: found -10; allowed: a finite number"]),
+        (MATTE % CHECKER % ", scale = nan", ["texture.scale: found nan; allowed: a finite number"]),
+        (MATTE % CHECKER % ', scale = "1"', ['texture.scale: found "1"; allowed: a finite number']),
+        (MATTE % CHECKER % ", scale = [2, 2, 2]", ["texture.scale: found [2, 2, 2]; allowed: a f"]),
+        (MATTE % CHECKER % ", tile = 1", ["texture.tile: unknown field; allowed: type, even, odd"]),
+        (MATTE % '{ type = "checker", odd = [1, 1, 1] }',
+         [f"texture.even: missing; required: {ALBEDO}"]),
+        ('type = "emitter", texture = { type = "checker", even = [9, 9, -9] }',
+         [f"texture.even[2]: found -9; allowed: {COLOR}", "texture.odd: missing; required: three"]),
+        (METAL + ", fuzz = -0.1", ["fuzz: found -0.1; allowed: a finite number ≥ 0"]),
+        (METAL + ", fuzz = nan", ["fuzz: found nan; allowed: a finite number ≥ 0"]),
+        (METAL + ", fuzz = inf", ["fuzz: found inf; allowed: a finite number ≥ 0"]),
+        (METAL + ', fuzz = "0"', ['fuzz: found "0"; allowed: a finite number ≥ 0']),
+        (METAL + ", roughness = 0", ["roughness: unknown field; allowed: type, texture, fuzz"]),
+        ('type = "metal", texture = [1.01, 1, 1], fuzz = -1',
+         ["fuzz: found -1; allowed: ", f"texture[0]: found 1.01; allowed: {ALBEDO}"]),
+    ],
+)  # fmt: skip
+def test_a_bad_surface_is_told(material, told):
+    found = problems(f"{CAMERA}[[object]]\n{BALL % 1}\nmaterial = {{ {material} }}\n")
+    assert len(found) == len(told), found
+    for text, phrase in zip(found, told, strict=True):
+        assert text.startswith(f"bad.toml:6: object[0].material.{phrase}")
+
+
+@pytest.mark.parametrize("kind", ["lambertian", "metal", "emitter"])
+def test_a_checker2d_on_a_sphere_is_refused(kind):
+    texture = '{ type = "checker2d", even = [1, 1, 1], odd = [0, 0, 0], tile = 1 }'
+    material = f'material = {{ type = "{kind}", texture = {texture} }}'
+    (found,) = problems(f"{CAMERA}[[object]]\n{BALL % 1}\n{material}\n")
+    assert found.startswith("bad.toml:6: object[0].material: a sphere cannot carry a checker2d")
 
 
 def test_glass_on_a_plane_is_refused():
@@ -433,12 +555,16 @@ def test_a_load_error_names_the_file(tmp_path):
 def test_a_scene_that_no_file_may_hold_is_not_written(tmp_path):
     path = tmp_path / "s.toml"
     path.write_text("old", encoding="utf-8")
-    bad = Object(Sphere([0, 0, np.nan], -1.0), Dielectric("N-BK7"))
+    bad = [
+        Object(Sphere([0, 0, np.nan], -1.0), Dielectric("N-BK7")),
+        Object(Sphere([0, 0, 0], 1.0), Lambertian([0, 0, 1.5])),
+    ]
     with pytest.raises(SceneError) as caught:
-        save_scene(Scene(Camera([0, 0, 4], [0, 0, 0]), [bad]), path)
+        save_scene(Scene(Camera([0, 0, 4], [0, 0, 0]), bad), path)
     assert [text.split(": ")[1] for text in caught.value.problems] == [
         "object[0].shape.center[2]",
         "object[0].shape.radius",
+        "object[1].material.texture.color[2]",
     ]
     assert path.read_text(encoding="utf-8") == "old"
 
@@ -471,7 +597,13 @@ def test_the_schema_is_json_and_accepts_the_samples():
 
 def test_the_defaults_of_the_schema_are_those_of_the_modules():
     tables = scene_schema()["$defs"]
-    for table, module in [("_Camera", Camera), ("_Background", Background), ("_Emitter", Emitter)]:
+    for table, module in [
+        ("_Camera", Camera),
+        ("_Background", Background),
+        ("_Checker", Checker),
+        ("_Metal", Metal),
+        ("_Emitter", Emitter),
+    ]:
         defaults = {field.name: field.default for field in dataclasses.fields(module)}
         shown = {k: p["default"] for k, p in tables[table]["properties"].items() if "default" in p}
         assert shown

@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from diffdisp.texture import Checker2D, Solid, as_texture, filtered_square_wave
+from diffdisp.texture import Checker, Checker2D, Solid, as_texture, filtered_square_wave
 
 RNG = np.random.default_rng(2)
 WAVE = jax.jit(jax.vmap(filtered_square_wave))
@@ -126,11 +126,12 @@ def test_three_numbers_are_a_solid():
     texture = as_texture((0.1, 0.2, 0.3))
     assert isinstance(texture, Solid)
     np.testing.assert_array_equal(texture.color, [0.1, 0.2, 0.3])
-    checker = Checker2D([1.0] * 3, [0.0] * 3, 0.5)
-    assert as_texture(checker) is checker
+    for checker in (Checker2D([1.0] * 3, [0.0] * 3, 0.5), Checker([1.0] * 3, [0.0] * 3)):
+        assert as_texture(checker) is checker
     assert as_texture(texture) is texture
 
 
 def test_the_numbers_of_a_texture_are_its_leaves():
     assert len(jax.tree.leaves(Checker2D([1, 1, 1], [0, 0, 0], 0.5))) == 3
+    assert len(jax.tree.leaves(Checker([1, 1, 1], [0, 0, 0]))) == 3
     assert jnp.result_type(Solid([1, 0, 0]).color) == np.float64

@@ -16,22 +16,25 @@ if TYPE_CHECKING:
     from diffdisp.geometry import Plane, Sphere
     from diffdisp.glasses import glass_source, glass_table, load_glass, named_glass
     from diffdisp.image import Picture, linear_rgb, read_picture, write_picture
-    from diffdisp.material import Dielectric, Emitter
+    from diffdisp.material import Dielectric, Emitter, Lambertian, Metal
     from diffdisp.planning import Plan, make_plan
     from diffdisp.rendering import render
     from diffdisp.report import result_table, write_fit_json, write_report
     from diffdisp.scene import Background, Object, Scene, with_glass
     from diffdisp.scene_file import SceneError, load_scene, save_scene, scene_schema
-    from diffdisp.texture import Checker2D, Solid
+    from diffdisp.texture import Checker, Checker2D, Solid
 
 __all__ = [
     "Background",
     "Camera",
+    "Checker",
     "Checker2D",
     "Dielectric",
     "Emitter",
     "Film",
     "FitResult",
+    "Lambertian",
+    "Metal",
     "Object",
     "Picture",
     "Plan",
@@ -71,13 +74,13 @@ _NAMES = {
     "geometry": ("Plane", "Sphere"),
     "glasses": ("glass_source", "glass_table", "load_glass", "named_glass"),
     "image": ("Picture", "linear_rgb", "read_picture", "write_picture"),
-    "material": ("Dielectric", "Emitter"),
+    "material": ("Dielectric", "Emitter", "Lambertian", "Metal"),
     "planning": ("Plan", "make_plan"),
     "rendering": ("render",),
     "report": ("result_table", "write_fit_json", "write_report"),
     "scene": ("Background", "Object", "Scene", "with_glass"),
     "scene_file": ("SceneError", "load_scene", "save_scene", "scene_schema"),
-    "texture": ("Checker2D", "Solid"),
+    "texture": ("Checker", "Checker2D", "Solid"),
 }
 _MODULE = {name: module for module, names in _NAMES.items() for name in names}
 

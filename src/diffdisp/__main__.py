@@ -293,7 +293,7 @@ def _film(size: tuple[int, int], bands: tuple[float, float, int] | None, samples
 
 def _check_glasses(scene: Any, bands: tuple[float, float, int] | None) -> None:
     """Check the range asked for, not the bands' middles: what is legal depends on no count."""
-    from diffdisp.rendering import COLOR_RANGE, check_glasses
+    from diffdisp.chunks import COLOR_RANGE, check_glasses
 
     low, high = (bands[0] / 1e3, bands[1] / 1e3) if bands else COLOR_RANGE
     check_glasses(scene, low, high)

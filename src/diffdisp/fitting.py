@@ -18,14 +18,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Float
 
-from diffdisp.color import albedo_basis, wavelength_strata
-from diffdisp.dispersion import LINE_C, LINE_D, LINE_F, LINE_G, Sellmeier, domain_error
-from diffdisp.film import Film
-from diffdisp.glasses import glass_table
-from diffdisp.image import Picture
-from diffdisp.integrator import lane_radiance
-from diffdisp.planning import Plan, make_plan
-from diffdisp.rendering import (
+from diffdisp.chunks import (
     COLOR_RANGE,
     WIDE_VECTORS,
     Pixels,
@@ -45,6 +38,13 @@ from diffdisp.rendering import (
     run_numbers,
     some_blocks,
 )
+from diffdisp.color import albedo_basis, wavelength_strata
+from diffdisp.dispersion import LINE_C, LINE_D, LINE_F, LINE_G, Sellmeier, domain_error
+from diffdisp.film import Film
+from diffdisp.glasses import glass_table
+from diffdisp.image import Picture
+from diffdisp.integrator import lane_radiance
+from diffdisp.planning import Plan, make_plan
 from diffdisp.scene import Scene, is_glass, object_glass, with_glass, without_names
 from diffdisp.vector import Array, Real
 
@@ -537,7 +537,7 @@ def _traced(
 
         def of_index(index: Array) -> Array:
             changed = (*indices[:ball], index, *indices[ball + 1 :])
-            return combine(lane_radiance(plan, changed, lanes), spectrum)
+            return combine(plan, lane_radiance(plan, changed, lanes), spectrum)
 
         def change(tangent: Array) -> tuple[Array, Array]:
             return jax.jvp(of_index, (index,), (tangent,))
@@ -826,7 +826,7 @@ def _index_table(problem: Problem, level: Level) -> np.ndarray:
     """Linear sRGB (indices, blocks, 3) of a level's picture at each index of the grid."""
     middle = sum(film_range(problem.film)) / 2
     part = level.parts[0]
-    plan = replace(part.plan, colour=True, dispersive=False, samples=4)
+    plan = replace(part.plan, bands=0, dispersive=False, samples=4)
     # Without dispersion a plan has one path for all wavelengths: here it is one for each index.
     spectrum = Spectrum(np.full(len(INDEX_GRID), middle), None, None)
     size, run = film_size(problem.film), run_numbers(plan, level.seed, 1e-3)

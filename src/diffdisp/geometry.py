@@ -50,6 +50,40 @@ def sphere_distances(ray: Ray, center: Vec3, radius: Real) -> tuple[Real, Real, 
     return jnp.minimum(q, other), jnp.maximum(q, other), discriminant > least
 
 
+def first_distance(ray: Ray, center: Vec3, radius: Real, on: Array) -> tuple[Real, Array]:
+    """Distance along the ray to the first point of a sphere ahead of it, and whether there is one.
+
+    A ray that starts on the sphere, or within rounding of it as where two surfaces touch, meets it
+    again only at the other end of a chord.
+
+    Args:
+        ray: the ray.
+        center: the sphere's.
+        radius: the sphere's.
+        on: whether the ray is known to start on the sphere.
+
+    Source:
+        As `sphere_distances`.
+    """
+    to_origin = ray.origin - center
+    b = -to_origin.dot(ray.direction)
+    foot = to_origin + ray.direction * b
+    squared, inside = to_origin.dot(to_origin), radius * radius
+    discriminant = inside - foot.dot(foot)
+    root = safe_sqrt(discriminant, least_square(b) * inside)
+    product = squared - inside
+    margin = (squared + inside) * (1e-13 if jnp.result_type(b) == jnp.float64 else 4e-7)
+    product = jnp.where(on | (jnp.abs(product) <= margin), 0.0, product)
+    # From outside the nearer root, from inside the farther one; each from the sum that does not
+    # cancel, or from the product of both.
+    sum_ahead = b + root
+    divide = (product > 0) | (b < 0)
+    divisor = jnp.where(b < 0, b - root, sum_ahead)
+    quotient = product / jnp.where(divisor == 0, 1.0, divisor)
+    distance = jnp.where(divide, quotient, sum_ahead)
+    return distance, (discriminant > 0) & (distance > 0)
+
+
 def plane_distance(ray: Ray, point: Vec3, normal: Vec3) -> Real:
     """Distance along the ray to a plane; -1 where they are parallel."""
     cosine = ray.direction.dot(normal)

@@ -8,30 +8,38 @@ summed without noise, and only several balls cost any.
 """
 
 from collections.abc import Callable
-from functools import partial
+from functools import partial, reduce
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero, zero_from_primal
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from diffdisp.camera import Camera, camera_ray
 from diffdisp.fresnel import cos_transmitted, fresnel_reflectance, reflect, refract
-from diffdisp.geometry import Plane, Ray, Sphere, plane_axes, plane_distance, sphere_distances
-from diffdisp.material import Emitter
+from diffdisp.geometry import (
+    Plane,
+    Ray,
+    Sphere,
+    first_distance,
+    plane_axes,
+    plane_distance,
+    sphere_distances,
+)
+from diffdisp.material import Dielectric, Emitter, Lambertian, Material, Metal
 from diffdisp.planning import Plan
-from diffdisp.sampling import low_discrepancy, sequence_steps
-from diffdisp.scene import Object, Scene, is_glass
-from diffdisp.texture import Checker2D, Solid, filtered_square_wave
-from diffdisp.vector import Array, Real, Triple, Vec3, choose, normalize, vec3
+from diffdisp.sampling import Numbers, uniform_direction
+from diffdisp.scene import Object, Scene, is_glass, texture_of
+from diffdisp.texture import Checker, Solid, filtered_square_wave
+from diffdisp.vector import Array, Real, Vec3, choose, normalize, vec3
 
 
 class World(NamedTuple):
-    """The geometry of a scene as tables: balls first, then lamps, then planes.
+    """The geometry of a scene as tables, rows in the order of the surfaces' numbers.
 
-    A surface's number is its row in that order; one past the last is the background.
+    Numbers are explained in `Plan`. Spheres are one table and planes the other.
     """
 
     centers: Vec3
@@ -39,63 +47,99 @@ class World(NamedTuple):
     points: Vec3
     normals: Vec3
     axes: tuple[Vec3, Vec3]
-    tiles: Float[Array, " planes"]
+    fuzz: Float[Array, " metals"]
 
 
-class Emission(NamedTuple):
-    """What the surfaces that end a path emit: lamps, planes, background, a row each.
+class Paint(NamedTuple):
+    """What surfaces show: a row each, after the glass balls; the background is the last.
 
-    A checker shows `mean` + m · `half` where m is +1 on its even tiles and -1 on its odd ones.
+    A checker shows `mean` + m · `half` where m is +1 on its even tiles and -1 on its odd ones. Of
+    what ends a path this is the radiance, of all others the share of the light that goes on.
+    `scale` is one over the edge of a tile, `cubes` tells the 3-D checkers.
     """
 
-    mean: Float[Array, "*lanes surfaces channels"]
-    half: Float[Array, "*lanes surfaces channels"]
+    mean: tuple[Float[Array, "*lanes rows"], ...]
+    half: tuple[Float[Array, "*lanes rows"], ...]
+    scale: Float[Array, " rows"]
+    cubes: Bool[Array, " rows"]
 
 
 class Path(NamedTuple):
-    """One path on its way to a glass ball."""
+    """One path on its way to a surface that sends it on.
+
+    `footprint` and `spectral` are None where nothing is integrated over the one, and where no
+    weight waits for the first dispersive glass.
+    """
 
     ray: Ray
-    footprint: tuple[Ray, Ray]
-    ball: Int[Array, ""]
+    footprint: tuple[Ray, Ray] | None
+    surface: Int[Array, ""]
     last: Int[Array, ""]
-    throughput: Real
-    radiance: Float[Array, " channels"]
+    throughput: tuple[Real, ...]
+    radiance: tuple[Real, ...]
     bounces: Int[Array, ""]
     alive: Array
+    spectral: Array | None
+
+
+def surfaces_of(scene: Scene) -> list[Object]:
+    """The objects in the order of the surfaces' numbers."""
+
+    def rank(obj: Object) -> int:
+        sphere = isinstance(obj.shape, Sphere)
+        material = type(obj.material)
+        if material is Emitter:
+            return 5 if sphere else 6
+        if sphere:
+            return {Dielectric: 0, Metal: 1, Lambertian: 2}[material]
+        return 3 if material is Lambertian else 4
+
+    return sorted(scene.objects, key=rank)
 
 
 def world_tables(scene: Scene) -> World:
     """The scene's geometry as tables."""
-    spheres, planes = _spheres(scene), _planes(scene)
-    normals = _table([normalize(vec3(p.normal)) for p, _ in planes])
+    surfaces = surfaces_of(scene)
+    spheres = [obj.shape for obj in surfaces if isinstance(obj.shape, Sphere)]
+    planes = [obj.shape for obj in surfaces if isinstance(obj.shape, Plane)]
+    normals = _table([normalize(vec3(p.normal)) for p in planes])
     return World(
-        _table([vec3(s.center) for s, _ in spheres]),
-        _row([s.radius for s, _ in spheres]),
-        _table([vec3(p.point) for p, _ in planes]),
+        _table([vec3(s.center) for s in spheres]),
+        _row([s.radius for s in spheres]),
+        _table([vec3(p.point) for p in planes]),
         normals,
         jax.vmap(plane_axes)(normals),
-        _row([_tile(obj, scene) for _, obj in planes]),
+        _row([obj.material.fuzz for obj in surfaces if isinstance(obj.material, Metal)]),
     )
 
 
-def emission_table(scene: Scene) -> Emission:
-    """What the scene's emitters and its background emit, linear sRGB in the last axis."""
-    colors = [_even_odd(o) for _, o in _spheres(scene) if not is_glass(o)]
-    colors += [_even_odd(obj) for _, obj in _planes(scene)]
-    colors.append((scene.background.color, scene.background.color))
-    even = jnp.stack([jnp.asarray(e) for e, _ in colors])
-    odd = jnp.stack([jnp.asarray(o) for _, o in colors])
-    return Emission(0.5 * (even + odd), 0.5 * (even - odd))
+def paint_table(scene: Scene) -> Paint:
+    """What the scene's surfaces and its background show, in linear sRGB."""
+    zero = jnp.zeros_like(scene.camera.vertical_fov)
+    rows = [_even_odd_scale(obj.material, zero) for obj in surfaces_of(scene) if not is_glass(obj)]
+    color = jnp.asarray(scene.background.color)
+    rows.append((color, color, zero, False))
+    even, odd = (jnp.stack([row[i] for row in rows], axis=-1) for i in (0, 1))
+    return Paint(
+        tuple(0.5 * (even + odd)),
+        tuple(0.5 * (even - odd)),
+        jnp.stack([row[2] for row in rows]),
+        np.array([row[3] for row in rows]),
+    )
 
 
-def _spheres(scene: Scene) -> list[tuple[Sphere, Object]]:
-    found = [(o.shape, o) for o in scene.objects if isinstance(o.shape, Sphere)]
-    return sorted(found, key=lambda pair: not is_glass(pair[1]))
-
-
-def _planes(scene: Scene) -> list[tuple[Plane, Object]]:
-    return [(obj.shape, obj) for obj in scene.objects if isinstance(obj.shape, Plane)]
+def _even_odd_scale(material: Material, zero: Real) -> tuple[Array, Array, Real, bool]:
+    """What even and odd tiles show, one over their edge, and whether they are cubes."""
+    texture = texture_of(material)
+    assert texture is not None
+    factor = material.intensity if isinstance(material, Emitter) else zero + 1.0
+    if isinstance(texture, Solid):
+        color = jnp.asarray(texture.color) * factor
+        return color, color, zero, False
+    cubes = isinstance(texture, Checker)
+    scale = texture.scale / np.pi if cubes else 1.0 / texture.tile
+    even, odd = (jnp.asarray(c) * factor for c in (texture.even, texture.odd))
+    return even, odd, jnp.asarray(scale), cubes
 
 
 def _row(values: list[Real]) -> Float[Array, " rows"]:
@@ -106,72 +150,123 @@ def _table(vectors: list[Vec3]) -> Vec3:
     return Vec3(*(_row([v[axis] for v in vectors]) for axis in range(3)))
 
 
-def _tile(obj: Object, scene: Scene) -> Real:
-    texture = obj.material.texture if isinstance(obj.material, Emitter) else None
-    one = jnp.ones_like(scene.camera.vertical_fov)
-    return texture.tile if isinstance(texture, Checker2D) else one
-
-
-def _even_odd(obj: Object) -> tuple[Triple, Triple]:
-    assert isinstance(obj.material, Emitter)
-    texture, intensity = obj.material.texture, obj.material.intensity
-    if isinstance(texture, Solid):
-        return texture.color * intensity, texture.color * intensity
-    return texture.even * intensity, texture.odd * intensity
-
-
 def _pick(table: Array, index: Array) -> Array:
-    """A row of a table; of a table of one row, that row, without a look-up."""
-    return table[0] if table.shape[0] == 1 else table[index]
+    """A row of a table that has it; of a table of one row, that row, without a look-up."""
+    if table.shape[0] == 1:
+        return table[0]
+    return table.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 def _pick_vector(table: Vec3, index: Array) -> Vec3:
     return Vec3(*(_pick(component, index) for component in table))
 
 
-Met = tuple[tuple[Real, Array], None]
-"""Distance and number of the nearest surface so far, as a scan hands them on."""
+class Candidates(NamedTuple):
+    """Spheres that a ray can meet, as a table with rows to spare.
+
+    Args:
+        centers: of the spheres; a row to spare has no size.
+        radii: of the spheres.
+        numbers: of the surfaces.
+        groups: how many groups of `group` rows count.
+        group: rows of a group, which are taken together.
+    """
+
+    centers: Vec3
+    radii: Float[Array, " rows"]
+    numbers: Int[Array, " rows"]
+    groups: Int[Array, ""] | int
+    group: int
 
 
-def nearest(ray: Ray, world: World, plan: Plan, last: Array) -> Array:
+MOST_TOGETHER = 8
+"""Spheres taken together: more of them spill from the processor's registers."""
+
+
+def all_spheres(world: World, plan: Plan, one: Array | None) -> Candidates:
+    """The table of all spheres; `one` as in `once`."""
+    groups = -(-plan.spheres // MOST_TOGETHER)
+    group = -(-plan.spheres // groups) if groups else 0
+    spare = groups * group - plan.spheres
+
+    def filled(row: Array) -> Array:
+        return jnp.pad(jnp.asarray(row), (0, spare))
+
+    return Candidates(
+        Vec3(*map(filled, world.centers)),
+        filled(world.radii),
+        filled(surface_numbers(plan)[0]),
+        groups if one is None or groups < 2 else groups * one,
+        group,
+    )
+
+
+def nearest(ray: Ray, world: World, plan: Plan, last: Array, spheres: Candidates) -> Array:
     """Number of the surface that a ray meets first.
 
     Args:
         ray: the ray; nothing is differentiated here, a number has no derivative.
         world: the scene's tables.
         plan: its static choices.
-        last: number of the sphere on which the ray starts, -1 for none. Its own distance of zero
-            is divided out, so that no offset is needed to leave it.
+        last: number of the surface on which the ray starts, -1 for none. Its own distance of
+            zero is divided out, so that no offset is needed to leave it.
+        spheres: those that the ray can meet.
     """
-    ray, world = jax.lax.stop_gradient((ray, world))
-    spheres, surfaces = plan.balls + plan.lamps, plan.balls + plan.lamps + plan.planes
-    best = (jnp.full_like(ray.origin.x, jnp.inf), jnp.full_like(last, surfaces))
-    numbers = np.arange(surfaces, dtype=np.int32)
+    ray, world, centers, radii = jax.lax.stop_gradient((ray, world, spheres.centers, spheres.radii))
+    word = jnp.int64 if plan.dtype == "float64" else jnp.int32
+    rows = np.asarray((1 << max(spheres.group - 1, 0).bit_length()) - 1, word)
 
-    def meet_sphere(best: tuple[Real, Array], row: tuple[Vec3, Real, Array]) -> Met:
-        center, radius, number = row
-        to_origin = ray.origin - center
-        near, far, hit = sphere_distances(ray, center, radius)
-        # Other surfaces may touch the one that the ray leaves: only there a small offset.
-        share = 1e-6 if plan.dtype == "float32" else 1e-13
-        least = share * (jnp.sqrt(to_origin.dot(to_origin)) + radius)
-        first = jnp.where(near > least, near, far)
-        distance = jnp.where(number == last, -2.0 * to_origin.dot(ray.direction), first)
-        found = jnp.where(number == last, distance > 0, hit & (first > least))
-        return _nearer(best, found, distance, number)
+    def of_group(group: Array | int) -> Array:
+        """The nearest of a group: its distance, with its row in the last bits.
 
-    def meet_plane(best: tuple[Real, Array], row: tuple[Vec3, Vec3, Array]) -> Met:
-        distance = plane_distance(ray, row[0], row[1])
-        return _nearer(best, distance > 0, distance, row[2])
+        Distances that differ in these alone are alike to rounding. Positive numbers are in the
+        order of the words that hold them, so that one word tells both; two results would each
+        compute all distances for itself.
+        """
+        words = []
+        for row in range(spheres.group):
+            place = group * spheres.group + row
+            center, radius = _pick_vector(centers, place), radii[place]
+            distance, meets = first_distance(ray, center, radius, spheres.numbers[place] == last)
+            far = jnp.where(meets, distance, jnp.inf)
+            words.append((jax.lax.bitcast_convert_type(far, word) & ~rows) | np.asarray(row, word))
+        return reduce(jnp.minimum, words)
 
-    best = _over(meet_sphere, best, (world.centers, world.radii, numbers[:spheres]), spheres)
-    best = _over(meet_plane, best, (world.points, world.normals, numbers[spheres:]), plan.planes)
-    return best[1]
+    def nearer(group: Array | int, found: Array, best: tuple[Array, Array]) -> tuple[Array, Array]:
+        closer = found < best[0]
+        return jnp.where(closer, found, best[0]), jnp.where(closer, group, best[1])
+
+    none = jax.lax.bitcast_convert_type(jnp.full_like(ray.origin.x, jnp.inf), word)
+    best, group = none, jnp.zeros_like(last)
+    if isinstance(spheres.groups, int) and spheres.groups == 1:
+        best = of_group(0)
+    elif spheres.group:
+
+        def turn(number: Array, carried: Any) -> Any:
+            """The group of the last turn is compared while that of this one is looked at."""
+            best, found = carried
+            return nearer(number - 1, found, best), of_group(number)
+
+        carried = jax.lax.fori_loop(0, spheres.groups, turn, ((best, group), none))
+        best, group = nearer(jnp.asarray(spheres.groups, jnp.int32) - 1, carried[1], carried[0])
+    place = group * spheres.group + (best & rows).astype(jnp.int32)
+    distance = jax.lax.bitcast_convert_type(best & ~rows, ray.origin.x.dtype)
+    number = jnp.where(distance < jnp.inf, _pick(spheres.numbers, place), plan.background)
+    for row, plane in enumerate(surface_numbers(plan)[1]):
+        point, normal = vec3_row(world.points, row), vec3_row(world.normals, row)
+        to_plane = plane_distance(ray, point, normal)
+        closer = (to_plane > 0) & (last != plane) & (to_plane < distance)
+        distance = jnp.where(closer, to_plane, distance)
+        number = jnp.where(closer, plane, number)
+    return number
 
 
-def _nearer(best: tuple[Real, Array], found: Array, distance: Real, number: Array) -> Met:
-    closer = found & (distance < best[0])
-    return (jnp.where(closer, distance, best[0]), jnp.where(closer, number, best[1])), None
+def surface_numbers(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
+    """The number of each row of the table of spheres, and of the table of planes."""
+    numbers = np.arange(plan.background, dtype=np.int32)
+    before, lamps, screens = np.split(numbers, [plan.first_lamp, plan.first_lamp + plan.lamps])
+    spheres, planes = np.split(before, [plan.first_plane])
+    return np.concatenate([spheres, lamps]), np.concatenate([planes, screens])
 
 
 def _over(step: Callable[[Any, Any], tuple[Any, None]], start: Any, rows: Any, count: int) -> Any:
@@ -180,61 +275,156 @@ def _over(step: Callable[[Any, Any], tuple[Any, None]], start: Any, rows: Any, c
 
 
 def push_forward(
-    f: Callable[[Ray], tuple[Any, Any]], ray: Ray, footprint: tuple[Ray, Ray]
+    f: Callable[[Ray], tuple[Any, Any]], ray: Ray, footprint: tuple[Ray, Ray] | None
 ) -> tuple[Any, Any, Any]:
     """`f(ray)`, its derivatives along both edges of the footprint, and what else `f` found out."""
+    if footprint is None:
+        value, extra = f(ray)
+        return value, None, extra
     value, push, extra = jax.linearize(f, ray, has_aux=True)
     return value, (push(footprint[0]), push(footprint[1])), extra
 
 
-def emitted(
+Channels = tuple[Real, ...]
+
+
+def painted(
     surface: Array,
-    ray: Ray,
-    footprint: tuple[Ray, Ray],
-    world: World,
-    emission: Emission,
+    point: Callable[[Ray], Vec3],
+    path: Path,
+    tables: "Tables",
     plan: Plan,
-) -> Float[Array, " channels"]:
-    """Radiance (channels,) of the surface that ends a ray, averaged over its footprint."""
-    row = jnp.maximum(surface - plan.balls, 0)
-    mean = _pick(emission.mean, row)
-    if not plan.checkered:
-        return mean
-    plane = surface - plan.balls - plan.lamps
-    on_plane = (plane >= 0) & (plane < plan.planes)
-    number = jnp.clip(plane, 0, plan.planes - 1)
+    emits: bool,
+) -> Channels:
+    """What a surface, which is not glass, shows to a ray.
 
-    def tile_coordinates(ray: Ray) -> tuple[tuple[Real, Real], None]:
-        point, normal = _pick_vector(world.points, number), _pick_vector(world.normals, number)
-        cosine = jnp.where(on_plane, ray.direction.dot(normal), 1.0)
-        distance = (point - ray.origin).dot(normal) / cosine
-        offset = ray.origin + ray.direction * distance - point
-        scale = 1.0 / _pick(world.tiles, number)
-        u, v = (_pick_vector(axis, number) for axis in world.axes)
-        return (offset.dot(u) * scale, offset.dot(v) * scale), None
+    Args:
+        surface: its number.
+        point: from the ray to where it meets the surface; a little beneath it.
+        path: ray and footprint.
+        tables: the scene.
+        plan: its static choices.
+        emits: whether the surface ends paths, as all those do that are asked for here.
+    """
+    paint, first = tables.paint, plan.first_lamp - plan.balls
+    rows = slice(first, None) if emits else slice(0, first)
+    mean, half = ([c[rows] for c in channels] for channels in (paint.mean, paint.half))
+    row = jnp.clip(surface - (plan.first_lamp if emits else plan.balls), 0, mean[0].shape[0] - 1)
+    tiled, cubed = (kinds[emits] for kinds in (plan.tiled, plan.cubed))
+    if not (tiled or cubed):
+        return tuple(_pick(channel, row) for channel in mean)
+    scale, waves = _pick(paint.scale[rows], row), []
+    if tiled:
+        plane = _plane_row(surface, plan)
 
-    (u, v), (across, down), _ = push_forward(tile_coordinates, ray, footprint)
-    mix = filtered_square_wave(u, across[0], down[0]) * filtered_square_wave(v, across[1], down[1])
-    return mean + _pick(emission.half, row) * jnp.where(on_plane, mix, 0.0)
+        def on_tiles(ray: Ray) -> tuple[tuple[Real, Real], None]:
+            offset = point(ray) - _pick_vector(tables.world.points, plane)
+            u, v = (_pick_vector(axis, plane) for axis in tables.world.axes)
+            return (offset.dot(u) * scale, offset.dot(v) * scale), None
+
+        waves.append(on_tiles)
+    if cubed:
+        waves.append(lambda ray: (tuple(point(ray) * scale), None))
+    is_cubes = _pick(paint.cubes[rows], row) if tiled and cubed else None
+    if path.footprint is None:
+        odd = _one_of([_is_odd(wave(path.ray)[0]) for wave in waves], is_cubes)
+        # Even and odd rows in one table: a look-up costs more than all else here.
+        place = row + jnp.where(odd, mean[0].shape[0], 0)
+        both = (jnp.concatenate([m + h, m - h]) for m, h in zip(mean, half, strict=True))
+        return tuple(_pick(channel, place) for channel in both)
+    mix = _one_of([_filtered(wave, path) for wave in waves], is_cubes)
+    return tuple(_pick(m, row) + _pick(h, row) * mix for m, h in zip(mean, half, strict=True))
+
+
+def _one_of(found: list[Array], second: Array | None) -> Array:
+    """The first, or where there are two the second if it is asked for."""
+    return found[0] if second is None else jnp.where(second, found[1], found[0])
+
+
+def _is_odd(coordinates: tuple[Real, ...]) -> Array:
+    """Whether a point is in an odd tile or cube: by one parity of all floors."""
+    cells = sum(jnp.floor(value) for value in coordinates)
+    return cells != 2.0 * jnp.floor(0.5 * cells)
+
+
+def _filtered(coordinates: Callable[[Ray], tuple[Any, None]], path: Path) -> Real:
+    """The mean over a footprint of +1 in even and -1 in odd tiles."""
+    values, edges, _ = push_forward(coordinates, path.ray, path.footprint)
+    return reduce(jnp.multiply, map(filtered_square_wave, values, *edges))
+
+
+def _beneath(point: Vec3, outward: Vec3, surface: Array, tables: "Tables", plan: Plan) -> Vec3:
+    """A thousandth of a cube beneath a point of a surface, where it is certain in which cube."""
+    if not any(plan.cubed):
+        return point
+    scale = _pick(tables.paint.scale, jnp.maximum(surface - plan.balls, 0))
+    return point - outward * (1e-3 / jnp.where(scale > 0, scale, 1.0))
+
+
+def emitted(surface: Array, path: Path, tables: "Tables", plan: Plan) -> Channels:
+    """Radiance of the surface that ends a path."""
+    world = tables.world
+    sphere = jnp.clip(surface - plan.first_lamp + plan.first_plane, 0, max(plan.spheres - 1, 0))
+    plane = _plane_row(surface, plan)
+    on_lamp = (surface >= plan.first_lamp) & (surface < plan.first_lamp + plan.lamps)
+    on_screen = (surface >= plan.first_lamp + plan.lamps) & (surface < plan.background)
+
+    def point(ray: Ray) -> Vec3:
+        where, outward = ray.origin, ray.direction
+        if plan.screens:
+            found = _on_plane(ray, plane, on_screen, world)
+            where = choose(on_screen, found, where)
+            outward = choose(on_screen, _pick_vector(world.normals, plane), outward)
+        if plan.lamps and plan.cubed[True]:
+            center, radius = _pick_vector(world.centers, sphere), _pick(world.radii, sphere)
+            near, far, _ = sphere_distances(ray, center, radius)
+            found = ray.origin + ray.direction * jnp.where(near > 0, near, far)
+            where = choose(on_lamp, found, where)
+            outward = choose(on_lamp, (found - center) * (1.0 / radius), outward)
+        return _beneath(where, outward, surface, tables, plan)
+
+    return painted(surface, point, path, tables, plan, emits=True)
+
+
+def _plane_row(surface: Array, plan: Plan) -> Array:
+    """The row of the table of planes in which a surface stands that is one."""
+    before = plan.matte_planes + plan.metal_planes
+    row = surface - plan.first_plane
+    if plan.screens:
+        row = jnp.where(row < before, row, row - plan.lamps)
+    return jnp.clip(row, 0, max(plan.planes - 1, 0))
+
+
+def _on_plane(ray: Ray, plane: Array, valid: Array, world: World) -> Vec3:
+    """Where a ray that is known to meet a plane meets it."""
+    point, normal = _pick_vector(world.points, plane), _pick_vector(world.normals, plane)
+    cosine = jnp.where(valid, ray.direction.dot(normal), 1.0)
+    distance = (point - ray.origin).dot(normal) / cosine
+    return ray.origin + ray.direction * distance
+
+
+class Tables(NamedTuple):
+    """A scene as the tracer sees it."""
+
+    world: World
+    paint: Paint
 
 
 def start_path(
     camera: Camera,
-    world: World,
-    emission: Emission,
+    tables: Tables,
     plan: Plan,
     height: Real,
     film_point: tuple[Real, Real],
     middle: tuple[Real, Real],
     cell: tuple[Real, Real],
 ) -> Path:
-    """The path from a film point to its first surface; ended, unless that one is glass.
+    """The path from a film point to its first surface; ended, unless that one sends it on.
 
     Args:
         camera: the camera.
-        world: the scene's tables.
-        emission: what ends paths.
-        plan: the scene's static choices.
+        tables: the scene.
+        plan: its static choices.
         height: rows of the picture.
         film_point: pixels to the right of and below the picture's upper left corner.
         middle: the picture's middle, in the same pixels.
@@ -244,26 +434,49 @@ def start_path(
     def through(x: Real, y: Real) -> Ray:
         return camera_ray(camera, height, x, y, middle)
 
-    ray, push = jax.linearize(through, *film_point)
     zero = jnp.zeros_like(film_point[0])
-    footprint = (push(zero + cell[0], zero), push(zero, zero + cell[1]))
-    surface = nearest(ray, world, plan, jnp.full(zero.shape, -1, jnp.int32))
-    on_glass = surface < plan.balls
-    shown = emitted(surface, ray, footprint, world, emission, plan)
+    if plan.scattering:
+        ray, footprint = through(*film_point), None
+    else:
+        ray, push = jax.linearize(through, *film_point)
+        footprint = (push(zero + cell[0], zero), push(zero, zero + cell[1]))
+    surface = nearest(
+        ray, tables.world, plan, no_surface(zero), all_spheres(tables.world, plan, None)
+    )
+    path = new_path(ray, footprint, surface, plan)
+    shown = emitted(surface, path, tables, plan)
+    ends = surface >= plan.first_lamp
+    return path._replace(radiance=tuple(jnp.where(ends, channel, 0.0) for channel in shown))
+
+
+def no_surface(like: Real) -> Array:
+    """The number -1, which no surface has."""
+    return jnp.full(jnp.shape(like), -1, jnp.int32)
+
+
+def new_path(ray: Ray, footprint: tuple[Ray, Ray] | None, surface: Array, plan: Plan) -> Path:
+    """A path that the camera sends to a surface."""
+    zero = jnp.zeros_like(ray.direction.x)
+    alive = (surface < plan.first_lamp) & (plan.depth > 1)
     return Path(
         ray,
         footprint,
-        jnp.where(on_glass, surface, 0),
-        jnp.full(zero.shape, -1, jnp.int32),
-        jnp.ones_like(zero),
-        jnp.where(on_glass, 0.0, shown),
+        jnp.where(alive, surface, 0),
+        no_surface(zero),
+        (jnp.ones_like(zero),) * (plan.channels if plan.scattering else 1),
+        (zero,) * plan.channels,
         jnp.zeros(zero.shape, jnp.int32),
-        on_glass & (plan.depth > 1),
+        alive,
+        jnp.zeros(zero.shape, bool) if plan.scattering and plan.dispersive else None,
     )
 
 
+Index = Callable[[Array | int], Real]
+"""From the number of a ball to the index of its glass at the path's wavelength."""
+
+
 def surface_indices(
-    point: Vec3, normal: Vec3, ball: Array, indices: Array, world: World, plan: Plan
+    point: Vec3, normal: Vec3, ball: Array, index: Index, world: World, plan: Plan
 ) -> tuple[Real, Real, jax.Array]:
     """Index outside and inside of a ball's surface, and whether there is an interface at all.
 
@@ -271,28 +484,28 @@ def surface_indices(
     ones the later), else air.
     """
     if not plan.nested:
-        return jnp.ones_like(point.x), _pick(indices, ball), jnp.ones(point.x.shape, bool)
+        return jnp.ones_like(point.x), index(ball), jnp.ones(point.x.shape, bool)
     off = _pick(world.radii, ball) * (1e-8 if plan.dtype == "float64" else 1e-4)
     n_out, n_in = (
-        _medium(point + normal * (off * sign), ball, sign < 0, indices, world, plan)
+        _medium(point + normal * (off * sign), ball, sign < 0, index, world, plan)
         for sign in (1.0, -1.0)
     )
     return n_out, n_in, n_out != n_in
 
 
 def _medium(
-    beside: Vec3, ball: Array, inside: bool, indices: Array, world: World, plan: Plan
+    beside: Vec3, ball: Array, inside: bool, index: Index, world: World, plan: Plan
 ) -> Real:
     """Index of the medium at a point just off the surface of `ball`, on a side that is known."""
-    smallest, index = jnp.full_like(beside.x, jnp.inf), jnp.ones_like(beside.x)
+    smallest, found = jnp.full_like(beside.x, jnp.inf), jnp.ones_like(beside.x)
     for number in range(plan.balls):
         offset = beside - vec3_row(world.centers, number)
         radius = world.radii[number]
         within = jnp.where(ball == number, inside, offset.dot(offset) < radius * radius)
         nearer = within & (radius <= smallest)
         smallest = jnp.where(nearer, radius, smallest)
-        index = jnp.where(nearer, indices[number], index)
-    return index
+        found = jnp.where(nearer, index(number), found)
+    return found
 
 
 def vec3_row(table: Vec3, number: int) -> Vec3:
@@ -300,107 +513,143 @@ def vec3_row(table: Vec3, number: int) -> Vec3:
     return Vec3(table.x[number], table.y[number], table.z[number])
 
 
-def bounce(
-    path: Path,
-    branch: Callable[[Array], Real],
-    indices: Float[Array, " balls"],
-    world: World,
-    emission: Emission,
-    plan: Plan,
-    inside: Array | bool,
-    cutoff: Real,
-    one: Array | None,
-) -> Path:
-    """The path advanced by one glass surface.
+class Interface(NamedTuple):
+    """A glass surface to a ray: where the media on both sides `differ`, it reflects and refracts.
+
+    `eta` is the index behind the surface over that before it.
+    """
+
+    eta: Real
+    cos_t: Real
+    reflectance: Real
+    differ: Array
+
+
+def glass_interface(
+    media: tuple[Real, Real, Array], cos_i: Real, leaves: Array | bool
+) -> Interface:
+    """What the surface of a ball is to a ray that leaves the ball there, or does not.
 
     Args:
-        path: a path on its way to a ball.
-        branch: from the number of the bounce to a number in [0, 1) that chooses.
-        indices: index of each ball's glass at the path's wavelength.
-        world: the scene's tables.
-        emission: what ends paths.
-        plan: the scene's static choices.
-        inside: whether the path is inside its ball; True or False where all paths are.
+        media: as `surface_indices` tells.
+        cos_i: cosine of the angle of incidence, ≥ 0.
+        leaves: whether the ray leaves the ball.
+    """
+    n_out, n_in, differ = media
+    eta = choose(leaves, n_out / n_in, n_in / n_out)
+    cos_t = cos_transmitted(cos_i, eta)
+    reflectance = jnp.where(differ, fresnel_reflectance(cos_i, cos_t, eta), 0.0)
+    return Interface(eta, cos_t, reflectance, differ)
+
+
+class Setting(NamedTuple):
+    """What a bounce needs beside its path.
+
+    Args:
+        tables: the scene.
+        plan: its static choices.
+        draw: from the number of the bounce, and which of its decisions, to a number in [0, 1).
+        index: index of a ball's glass at the path's wavelength.
+        weights: what the path counts once it has met dispersive glass; None where nothing does.
         cutoff: part of its light with which a path ends.
         one: as in `once`.
     """
-    center, radius = _pick_vector(world.centers, path.ball), _pick(world.radii, path.ball)
+
+    tables: Tables
+    plan: Plan
+    draw: Callable[[Array, int], Real]
+    index: Index
+    weights: Channels | None
+    cutoff: Real
+    one: Array | None
+
+
+def bounce(path: Path, setting: Setting, inside: bool | None = None) -> Path:
+    """The path advanced by one surface.
+
+    Args:
+        path: a path on its way to a surface that sends it on.
+        setting: the rest.
+        inside: whether the path is inside its ball, where that is known of all paths.
+    """
+    if setting.plan.scattering:
+        return _one_way(path, setting)
+    return _both_ways(path, setting, path.last == path.surface if inside is None else inside)
+
+
+def _both_ways(path: Path, setting: Setting, inside: Array | bool) -> Path:
+    """A bounce in a scene that sends paths on only from glass: two ways, chosen at the end."""
+    (world, _), plan, ball = setting.tables, setting.plan, path.surface
+    center, radius = _pick_vector(world.centers, ball), _pick(world.radii, ball)
 
     def scatter(ray: Ray) -> tuple[tuple[Ray, Ray], tuple[Real, Array]]:
-        distance = _distance_to_ball(ray, center, radius, path, plan, inside)
+        distance = _distance_to_ball(ray, center, radius, plan, inside)
         outward = normalize(ray.origin + ray.direction * distance - center)
         point = center + outward * radius
-        cosine = ray.direction.dot(outward)
         # A border within glass, or a camera there, shows its side only here.
-        leaves = cosine > 0 if plan.nested else inside
-        n_out, n_in, differ = surface_indices(point, outward, path.ball, indices, world, plan)
-        eta = choose(leaves, n_out / n_in, n_in / n_out)
+        leaves = ray.direction.dot(outward) > 0 if plan.nested else inside
         facing = choose(leaves, -outward, outward)
-        cos_i = jnp.abs(cosine)
-        cos_t = cos_transmitted(cos_i, eta)
+        cos_i = jnp.abs(ray.direction.dot(outward))
+        media = surface_indices(point, outward, ball, setting.index, world, plan)
+        glass = glass_interface(media, cos_i, leaves)
         mirrored = reflect(ray.direction, facing, cos_i)
-        bent = refract(ray.direction, facing, cos_i, cos_t, eta)
+        bent = refract(ray.direction, facing, cos_i, glass.cos_t, glass.eta)
         outer = Ray(point, choose(leaves, bent, mirrored))
         inner = Ray(point, choose(leaves, mirrored, bent))
-        reflectance = jnp.where(differ, fresnel_reflectance(cos_i, cos_t, eta), 0.0)
-        outer_share = choose(leaves, 1.0 - reflectance, reflectance)
-        return (outer, inner), (outer_share, differ)
+        outer_share = choose(leaves, 1.0 - glass.reflectance, glass.reflectance)
+        return (outer, inner), (outer_share, glass.differ)
 
     (outer, inner), tangents, (outer_share, differ) = once(
-        lambda: push_forward(scatter, path.ray, path.footprint), one
+        lambda: push_forward(scatter, path.ray, path.footprint), setting.one
     )
     outer_print, inner_print = (tuple(t[i] for t in tangents) for i in (0, 1))
-    inner_share = 1.0 - outer_share
+    inner_share, throughput = 1.0 - outer_share, path.throughput[0]
 
-    surface, light = _next(outer, outer_print, path.ball, world, emission, plan)
-    arrives = path.alive & (surface >= plan.balls)
-    radiance = path.radiance + jnp.where(arrives, path.throughput * outer_share * light, 0.0)
-    outer_goes, outer_ball = (surface < plan.balls) & (outer_share > 0), surface
-    inner_goes, inner_ball = inner_share > 0, path.ball
+    spheres = all_spheres(world, plan, setting.one)
+
+    def arrive(ray: Ray, footprint: tuple[Ray, Ray], share: Real, radiance: Channels) -> Any:
+        """The surface that the ray meets, and the radiance with what that one adds."""
+        surface = nearest(ray, world, plan, ball, spheres)
+        light = emitted(surface, path._replace(ray=ray, footprint=footprint), setting.tables, plan)
+        factor = jnp.where(path.alive & (surface >= plan.first_lamp), throughput * share, 0.0)
+        return surface, tuple(r + factor * x for r, x in zip(radiance, light, strict=True))
+
+    outer_surface, radiance = arrive(outer, outer_print, outer_share, path.radiance)
+    outer_goes = (outer_surface < plan.first_lamp) & (outer_share > 0)
+    inner_goes, inner_surface = inner_share > 0, ball
     if plan.nested:
-        surface, light = _next(inner, inner_print, path.ball, world, emission, plan)
-        arrives = path.alive & (surface >= plan.balls)
-        radiance = radiance + jnp.where(arrives, path.throughput * inner_share * light, 0.0)
-        inner_goes, inner_ball = inner_goes & (surface < plan.balls), surface
+        inner_surface, radiance = arrive(inner, inner_print, inner_share, radiance)
+        inner_goes = inner_goes & (inner_surface < plan.first_lamp)
 
-    share, goes_on, ball = inner_share, inner_goes, inner_ball
-    ray, footprint = inner, inner_print
+    way = (inner_share, inner_goes, inner_surface, inner, inner_print)
     if plan.random:  # with one ball, whatever leaves it never comes back
         chance = jnp.where(inner_goes, jax.lax.stop_gradient(outer_share), 1.0)
         chance = jnp.where(outer_goes, chance, 0.0)
-        go_out = branch(path.bounces) < chance
-        share, goes_on, ball, ray, footprint = choose(
-            go_out,
-            (outer_share, outer_goes, outer_ball, outer, outer_print),
-            (inner_share, inner_goes, inner_ball, inner, inner_print),
-        )
-        share = share / jnp.where(go_out, chance, 1.0 - chance)
+        go_out = setting.draw(path.bounces, 0) < chance
+        way = choose(go_out, (outer_share, outer_goes, outer_surface, outer, outer_print), way)
+        way = (way[0] / jnp.where(go_out, chance, 1.0 - chance), *way[1:])
+    share, goes_on, surface, ray, footprint = way
+    moved = path._replace(
+        ray=ray, footprint=footprint, surface=surface, last=ball, throughput=(throughput * share,)
+    )
+    return _go_on(path, moved, goes_on, differ, radiance, setting)
 
-    throughput = path.throughput * share
+
+def _go_on(
+    path: Path, moved: Path, goes_on: Array, differ: Array, radiance: Channels, setting: Setting
+) -> Path:
+    """The moved path if it goes on; else the old one, ended, with finite numbers."""
     bounces = path.bounces + jnp.where(differ, 1, 0)
+    brightest = reduce(jnp.maximum, moved.throughput)
     # A path of b bounces has b + 1 segments, and the light that it adds next came over one more.
-    alive = path.alive & goes_on & (throughput > cutoff) & (bounces < plan.depth - 1)
-    moved = Path(ray, footprint, ball, path.ball, throughput, path.radiance, bounces, path.alive)
-    # A path that has ended stays where it was: its numbers stay finite.
-    kept = choose(alive, moved, path)
+    alive = path.alive & goes_on & (brightest > setting.cutoff)
+    alive = alive & (bounces < setting.plan.depth - 1)
+    kept = choose(alive, moved._replace(bounces=bounces), path)
     return kept._replace(radiance=radiance, alive=alive)
 
 
-def _next(
-    ray: Ray,
-    footprint: tuple[Ray, Ray],
-    ball: Array,
-    world: World,
-    emission: Emission,
-    plan: Plan,
-) -> tuple[Array, Float[Array, " channels"]]:
-    """The surface that a ray from `ball` meets first, and what that one emits."""
-    surface = nearest(ray, world, plan, ball)
-    return surface, emitted(surface, ray, footprint, world, emission, plan)
-
-
 def _distance_to_ball(
-    ray: Ray, center: Vec3, radius: Real, path: Path, plan: Plan, inside: Array | bool
+    ray: Ray, center: Vec3, radius: Real, plan: Plan, inside: Array | bool
 ) -> Real:
     """Distance to the ball that the path is known to meet next."""
     across = -2.0 * (ray.origin - center).dot(ray.direction)
@@ -409,6 +658,313 @@ def _distance_to_ball(
     near, far, _ = sphere_distances(ray, center, radius)
     ahead = jnp.where(near > 0, near, far) if plan.nested else near
     return choose(inside, across, ahead)
+
+
+class Scattered(NamedTuple):
+    """Where a path goes from the surface that it met, and what it is lit by there.
+
+    Args:
+        ray: the way it goes.
+        throughput: of the path from now on.
+        goes_on: whether any light goes that way.
+        differ: whether there was a surface at all: between equal media there is none.
+        matte: whether the surface is matte.
+        density: of the chosen direction, in solid angle, where matte.
+        lamp: number of the lamp that the ray `to_lamp` aims at.
+        to_lamp: a ray to a point of that lamp.
+        lamp_share: what the lamp's radiance counts if it is seen.
+        lamp_total: density of lamp directions, for a unit of luminance.
+        spectral: whether dispersive glass has been met.
+    """
+
+    ray: Ray
+    throughput: Channels
+    goes_on: Array
+    differ: Array
+    matte: Array
+    density: Real | None
+    lamp: Array | None
+    to_lamp: Ray | None
+    lamp_share: Real | None
+    lamp_total: Real | None
+    spectral: Array | None
+
+
+def _one_way(path: Path, setting: Setting) -> Path:
+    """A bounce in a scene with matte or metal surfaces: one way, chosen at once."""
+    plan, tables = setting.plan, setting.tables
+    scattered = _scatter(path, setting)
+    moved = path._replace(
+        ray=scattered.ray,
+        last=path.surface,
+        throughput=scattered.throughput,
+        spectral=scattered.spectral,
+    )
+    radiance = path.radiance
+    if plan.lit:
+        shown = once(lambda: _lamplight(path, scattered, setting), setting.one)
+        radiance = tuple(r + x for r, x in zip(radiance, shown, strict=True))
+    spheres = all_spheres(tables.world, plan, setting.one)
+    surface = nearest(moved.ray, tables.world, plan, path.surface, spheres)
+    light = emitted(surface, moved, tables, plan)
+    arrives = path.alive & scattered.goes_on & (surface >= plan.first_lamp)
+    factor = jnp.where(arrives, 1.0, 0.0)
+    if plan.lit:
+        factor = factor * _chance_weight(surface, scattered, tables, plan)
+    radiance = tuple(
+        r + jnp.where(arrives, t * factor * x, 0.0)
+        for r, t, x in zip(radiance, scattered.throughput, light, strict=True)
+    )
+    goes_on = scattered.goes_on & (surface < plan.first_lamp)
+    return _go_on(
+        path, moved._replace(surface=surface), goes_on, scattered.differ, radiance, setting
+    )
+
+
+def _scatter(path: Path, setting: Setting) -> Scattered:
+    """What the surface that a path meets does to it."""
+    (world, _), plan, surface = setting.tables, setting.plan, path.surface
+    old = path.ray.direction
+    first_matte, after_matte = plan.mattes
+    is_matte = (surface >= first_matte) & (surface < after_matte)
+    is_glass = surface < plan.balls
+    draw = partial(setting.draw, path.bounces)
+
+    point, outward, cosine = once(lambda: _meet(path, setting), setting.one)
+    leaves, cos_i = cosine > 0, jnp.abs(cosine)
+    facing = choose(leaves, -outward, outward)
+
+    ball = jnp.minimum(surface, plan.balls - 1)
+    media = plan.balls and once(
+        lambda: surface_indices(point, outward, ball, setting.index, world, plan), setting.one
+    )
+
+    def ways() -> tuple[Mix, Vec3 | None, Array]:
+        """How the new direction is mixed, of what, and whether there is a surface at all."""
+        unit, zero = None, jnp.zeros_like(cosine)
+        mix, differ = Mix(zero + 1.0, 2.0 * cos_i, zero), jnp.ones(cosine.shape, bool)
+        if plan.numbers_per_bounce > 1:
+            unit = uniform_direction(draw(0), draw(1))
+        if plan.fuzzy:
+            metal = jnp.where(surface < first_matte, surface, surface - after_matte + first_matte)
+            fuzz = _pick(world.fuzz, jnp.clip(metal - plan.balls, 0, plan.metals - 1))
+            # The radius of a uniform point of the unit ball: the cube root, by its logarithm.
+            radius = jnp.exp(jnp.log(jnp.maximum(draw(2), 1e-12)) * (1.0 / 3.0))
+            mix = mix._replace(unit=radius * fuzz)
+        if after_matte > first_matte:
+            mix = choose(is_matte, Mix(zero, zero + 1.0, zero + 1.0), mix)
+        if plan.balls:
+            glass = glass_interface(media, cos_i, leaves)
+            mirrored = draw(0) < jax.lax.stop_gradient(glass.reflectance)
+            bent = Mix(1.0 / glass.eta, cos_i / glass.eta - glass.cos_t, zero)
+            through = choose(mirrored, Mix(zero + 1.0, 2.0 * cos_i, zero), bent)
+            mix, differ = choose(is_glass, through, mix), glass.differ | ~is_glass
+        return mix, unit, differ
+
+    mix, unit, differ = once(ways, setting.one)
+
+    def mixed() -> Vec3:
+        """The new direction, of any length."""
+        direction = old * mix.old + facing * mix.facing
+        return direction if unit is None else direction + unit * mix.unit
+
+    raw = once(mixed, setting.one)
+
+    def finished() -> Scattered:
+        squared = raw.dot(raw)
+        # A matte or fuzzy direction may vanish, as it does once in a million.
+        vanishes = squared < 1e-12
+        length = jnp.sqrt(jnp.where(vanishes, 1.0, squared))
+        direction = choose(vanishes, facing, raw * (1.0 / length))
+        goes_on = jnp.ones(cosine.shape, bool)
+        if plan.fuzzy:
+            goes_on = is_matte | is_glass | (direction.dot(facing) > 0)
+        sunk = _beneath(point, outward, surface, setting.tables, plan)
+        albedo = painted(surface, lambda _: sunk, path, setting.tables, plan, emits=False)
+        throughput = tuple(
+            t * jnp.where(is_glass, 1.0, a) for t, a in zip(path.throughput, albedo, strict=True)
+        )
+        spectral = path.spectral
+        if spectral is not None:
+            now = is_glass & ~spectral
+            spectral = spectral | is_glass
+            if setting.weights is not None:
+                throughput = tuple(
+                    t * jnp.where(now, w, 1.0)
+                    for t, w in zip(throughput, setting.weights, strict=True)
+                )
+        ray = Ray(point, direction)
+        scattered = Scattered(
+            ray, throughput, goes_on, differ, is_matte, None, None, None, None, None, spectral
+        )
+        return _aim(scattered, facing, draw, setting) if plan.lit else scattered
+
+    return once(finished, setting.one)
+
+
+class Mix(NamedTuple):
+    """A new direction: so much of the old one, of the normal against it, of a random unit vector.
+
+    A mirror direction is d + 2 cos θ n; a refracted one is d/η + (cos θ/η - cos θ') n; one that is
+    spread by the cosine is n + u (Shirley and Morley, Realistic Ray Tracing (2003), section 9.4).
+    """
+
+    old: Real
+    facing: Real
+    unit: Real
+
+
+def _meet(path: Path, setting: Setting) -> tuple[Vec3, Vec3, Real]:
+    """Where a path meets its surface, the normal there, and the path's cosine to it.
+
+    The normal of a sphere is the outward one.
+    """
+    (world, _), plan, ray, surface = setting.tables, setting.plan, path.ray, path.surface
+    rows = plan.first_plane
+    if rows:
+        row = jnp.minimum(surface, rows - 1)
+        center, radius = _pick_vector(world.centers, row), _pick(world.radii, row)
+        again = path.last == surface
+        distance, _ = first_distance(ray, center, radius, again)
+        outward = normalize(ray.origin + ray.direction * distance - center)
+        # Back onto the sphere: in float32 the ray ends some way off a large one.
+        point = center + outward * radius
+    if plan.matte_planes + plan.metal_planes:
+        plane, on_plane = _plane_row(surface, plan), surface >= rows
+        normal = _pick_vector(world.normals, plane)
+        flat = _on_plane(ray, plane, on_plane, world)
+        flat = flat - normal * (flat - _pick_vector(world.points, plane)).dot(normal)
+        point, outward = choose(
+            on_plane, (flat, normal), (point, outward) if rows else (flat, normal)
+        )
+    return point, outward, ray.direction.dot(outward)
+
+
+# Lamps: the next segment of a path from a matte surface is chosen both by its cosine and by the
+# lamps in view, and each choice is weighted by the balance heuristic.
+# Source: Veach, Robust Monte Carlo Methods for Light Transport Simulation (1997), section 9.2.
+
+
+def _aim(
+    scattered: Scattered, facing: Vec3, draw: Callable[[int], Real], setting: Setting
+) -> Scattered:
+    """The same with a ray to one of the lamps, and the densities of both choices.
+
+    A lamp is chosen by its luminance times its solid angle, and a direction uniformly in the
+    cone of its sphere. The density of a direction to a lamp is then its luminance over the sum.
+    """
+    (world, paint), plan, point = setting.tables, setting.plan, scattered.ray.origin
+    zero = jnp.zeros_like(point.x)
+
+    def weigh(best: Any, lamp: tuple[Vec3, Real, Real, Array]) -> tuple[Any, None]:
+        total, number, u = best
+        center, radius, luminance, row = lamp
+        weight = luminance * _lamp_angle(point, facing, center, radius)
+        total = total + weight
+        share = weight / jnp.where(total > 0, total, 1.0)
+        taken = u < share
+        rest = jnp.where(taken, share, 1.0 - share)
+        u = jnp.where(taken, u, u - share) / jnp.where(rest > 0, rest, 1.0)
+        return (total, jnp.where(taken, row, number), u), None
+
+    lamps = slice(plan.first_plane, plan.spheres)
+    centers = Vec3(*(axis[lamps] for axis in world.centers))
+    rows = (
+        centers,
+        world.radii[lamps],
+        _luminances(paint, plan),
+        np.arange(plan.lamps, dtype=np.int32),
+    )
+    start = (zero, jnp.zeros(zero.shape, jnp.int32), draw(2))
+    total, lamp, _ = _over(weigh, start, rows, plan.lamps)
+
+    center = _pick_vector(centers, lamp)
+    radius = _pick(rows[1], lamp)
+    offset = center - point
+    squared = offset.dot(offset)
+    axis = offset * (1.0 / jnp.sqrt(squared))
+    drop = draw(3) * _cap(jnp.minimum(radius * radius / squared, 1.0))
+    turned = uniform_direction(0.5 * drop, draw(4))
+    direction = _turn_to(axis, turned)
+    cosine = facing.dot(direction)
+    chosen = jnp.maximum(facing.dot(scattered.ray.direction), 0.0) / np.pi
+    density = _pick(rows[2], lamp) / (2.0 * np.pi * jnp.where(total > 0, total, 1.0))
+    # Radiance · BRDF · cosine over both densities; the albedo is in the throughput.
+    ahead = scattered.matte & (total > 0) & (cosine > 0)
+    by_chance = jnp.maximum(cosine, 0.0) / np.pi
+    share = jnp.where(ahead, by_chance / (by_chance + jnp.where(ahead, density, 1.0)), 0.0)
+    return scattered._replace(
+        density=chosen,
+        lamp=lamp + plan.first_lamp,
+        to_lamp=Ray(point, direction),
+        lamp_share=share,
+        lamp_total=total,
+    )
+
+
+def _luminances(paint: Paint, plan: Plan) -> Real:
+    """A number for the brightness of each lamp: the mean of its channels."""
+    first = plan.first_lamp - plan.balls
+    brightness = [mean[first : first + plan.lamps] for mean in paint.mean]
+    return sum(brightness[1:], brightness[0]) * (1.0 / len(brightness))
+
+
+def _cap(squared_sine: Real) -> Real:
+    """1 - cos θ from sin² θ, for θ below a right angle, without cancellation."""
+    return squared_sine / (1.0 + jnp.sqrt(jnp.maximum(1.0 - squared_sine, 0.0)))
+
+
+def _lamp_angle(point: Vec3, facing: Vec3, center: Vec3, radius: Real) -> Real:
+    """Solid angle over 2π of a lamp's sphere; 0 where it is below the horizon or all around."""
+    offset = center - point
+    squared = offset.dot(offset)
+    above = (offset.dot(facing) > -radius) & (squared > radius * radius * (1.0 + 1e-4))
+    return jnp.where(above, _cap(radius * radius / jnp.where(above, squared, 1.0)), 0.0)
+
+
+def _turn_to(axis: Vec3, vector: Vec3) -> Vec3:
+    """The vector turned as the x axis is turned to `axis`.
+
+    Source:
+        Duff et al., "Building an Orthonormal Basis, Revisited", JCGT 6 (2017), with x for z.
+    """
+    sign = jnp.where(axis.x < 0, -1.0, 1.0)
+    a = -1.0 / (sign + axis.x)
+    b = axis.y * axis.z * a
+    first = Vec3(-sign * axis.y, 1.0 + sign * axis.y * axis.y * a, sign * b)
+    second = Vec3(-axis.z, b, sign + axis.z * axis.z * a)
+    return axis * vector.x + first * vector.y + second * vector.z
+
+
+def _lamplight(path: Path, scattered: Scattered, setting: Setting) -> Channels:
+    """Radiance that comes straight from the lamp that was aimed at."""
+    tables, plan = setting.tables, setting.plan
+    assert scattered.to_lamp is not None
+    assert scattered.lamp_share is not None
+    to_lamp = path._replace(ray=scattered.to_lamp)
+    spheres = all_spheres(tables.world, plan, setting.one)
+    surface = nearest(scattered.to_lamp, tables.world, plan, path.surface, spheres)
+    assert scattered.lamp is not None
+    light = emitted(scattered.lamp, to_lamp, tables, plan)
+    factor = jnp.where(path.alive & (surface == scattered.lamp), scattered.lamp_share, 0.0)
+    return tuple(t * factor * x for t, x in zip(scattered.throughput, light, strict=True))
+
+
+def _chance_weight(surface: Array, scattered: Scattered, tables: Tables, plan: Plan) -> Real:
+    """The balance heuristic's weight of light that was met by chance."""
+    world, first = tables.world, plan.first_lamp
+    assert scattered.density is not None
+    assert scattered.lamp_total is not None
+    lamp = jnp.clip(surface - first, 0, plan.lamps - 1)
+    row = lamp + plan.first_plane
+    offset = _pick_vector(world.centers, row) - scattered.ray.origin
+    radius = _pick(world.radii, row)
+    outside = offset.dot(offset) > radius * radius * (1.0 + 1e-4)
+    weighed = scattered.matte & outside & (surface >= first) & (surface < first + plan.lamps)
+    total = jnp.where(scattered.lamp_total > 0, scattered.lamp_total, 1.0)
+    aimed = _pick(_luminances(tables.paint, plan), lamp) / (2.0 * np.pi * total)
+    both = scattered.density + aimed
+    return jnp.where(weighed, scattered.density / jnp.where(both > 0, both, 1.0), 1.0)
 
 
 def once(stage: Callable[[], Any], one: Array | None) -> Any:
@@ -425,8 +981,15 @@ def once(stage: Callable[[], Any], one: Array | None) -> Any:
     """
     if one is None:
         return stage()
-    empty = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(stage))
-    return jax.lax.fori_loop(jnp.zeros_like(one), one, lambda _, old: stage(), empty)
+    # Traced here, so that the loop need not trace it again.
+    traced, shape = jax.make_jaxpr(stage, return_shape=True)()
+    structure = jax.tree.structure(shape)
+    empty = [jnp.zeros(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(shape)]
+
+    def again(_: Array, old: list[Array]) -> list[Array]:
+        return jax.core.eval_jaxpr(traced.jaxpr, traced.consts)
+
+    return jax.tree.unflatten(structure, jax.lax.fori_loop(jnp.zeros_like(one), one, again, empty))
 
 
 class Lanes(NamedTuple):
@@ -439,7 +1002,7 @@ class Lanes(NamedTuple):
     """
 
     world: World
-    emission: Emission
+    paint: Paint
     weights: Float[Array, "wavelengths samples channels"] | None
     camera: Camera
     height: Real
@@ -520,57 +1083,76 @@ Loop = Callable[[Callable[[Path], Path], Path, Plan], Path]
 
 def _radiance(plan: Plan, indices: tuple[Array, ...], lanes: Lanes, loop: Loop) -> Array:
     """`lane_radiance`, with the loop that the wanted derivative allows."""
-    world = lanes.world
+    middle, cell = lanes.middle, lanes.cell
 
-    def start(x: Real, y: Real, emission: Emission) -> Path:
-        return start_path(
-            lanes.camera, world, emission, plan, lanes.height, (x, y), lanes.middle, lanes.cell
-        )
+    def start(x: Real, y: Real, paint: Paint) -> Path:
+        tables = Tables(lanes.world, paint)
+        return start_path(lanes.camera, tables, plan, lanes.height, (x, y), middle, cell)
 
-    every = jax.vmap(jax.vmap(jax.vmap(start, (0, 0, None)), (0, 0, None)), (None, None, 0))
-    paths = every(lanes.x, lanes.y, lanes.emission)
+    waves = Paint(0, 0, None, None)  # type: ignore[arg-type]
+    every = jax.vmap(jax.vmap(jax.vmap(start, (0, 0, None)), (0, 0, None)), (None, None, waves))
+    paths = every(lanes.x, lanes.y, lanes.paint)
     met = jnp.any(paths.alive, axis=0)
-    if plan.balls:
-        paths = _through_glass(plan, indices, lanes, paths, loop)
+    if plan.first_lamp:
+        paths = _to_the_end(plan, indices, lanes, paths, waves, loop)
+    radiance = jnp.stack(paths.radiance, axis=-1)
     if lanes.weights is None:
-        return jnp.mean(paths.radiance, axis=1, keepdims=True)
+        return jnp.mean(radiance, axis=1, keepdims=True)
     alike = 1.0 / (lanes.weights.shape[0] * lanes.weights.shape[1])
+    if plan.scattering:  # a path has been weighted where it met glass, if it did
+        return radiance * alike
     weights = jnp.where(met[None, :, :, None], lanes.weights[:, :, None, :], alike)
-    return paths.radiance * weights
+    return radiance * weights
 
 
-def _through_glass(
-    plan: Plan, indices: tuple[Array, ...], lanes: Lanes, paths: Path, loop: Loop
+def _to_the_end(
+    plan: Plan, indices: tuple[Array, ...], lanes: Lanes, paths: Path, waves: Paint, loop: Loop
 ) -> Path:
     """The paths followed to their ends."""
-    world = lanes.world
-    steps = jnp.asarray(sequence_steps(plan.depth if plan.random else 1))
-    index = jnp.stack(indices, axis=-1)
-    by_sample = 0 if index.ndim == 3 else None
+    numbers = Numbers(plan.numbers_per_bounce, lanes.seed, plan.dtype)
+    copies = paths.alive.shape[0]
+    wave = np.arange(copies, dtype=np.uint32)
+    index = jnp.stack(indices, axis=-1) if indices else None
+    by_sample = 0 if index is not None and index.ndim == 3 else None
+    weights = None
+    if lanes.weights is not None:
+        count = lanes.weights.shape[0] * lanes.weights.shape[1]
+        weights = tuple(jnp.moveaxis(lanes.weights * count, -1, 0))
 
     def advance(
         path: Path,
         pixel: Array,
         sample: Array,
-        index: Array,
-        emission: Emission,
+        wave: Array,
+        index: Array | None,
+        weights: Channels | None,
+        paint: Paint,
         inside: bool | None,
     ) -> Path:
-        def branch(bounces: Array) -> Real:
-            word = bounces.astype(jnp.uint32)
-            step = steps[bounces]
-            return low_discrepancy(pixel, sample, word, step, lanes.seed, plan.dtype)
-
-        side = path.last == path.ball if inside is None else inside
-        return bounce(path, branch, index, world, emission, plan, side, lanes.cutoff, lanes.one)
+        # Paths of one sample at several wavelengths share their numbers only if summed branches
+        # leave them few to draw.
+        word = sample * np.uint32(copies) + wave if plan.scattering else sample
+        setting = Setting(
+            Tables(lanes.world, paint),
+            plan,
+            partial(numbers.of_bounce, pixel, word),
+            lambda ball: _pick(index, ball),  # type: ignore[arg-type]
+            weights,
+            lanes.cutoff,
+            lanes.one,
+        )
+        return bounce(path, setting, inside)
 
     def every_path(inside: bool | None) -> Callable[[Path], Path]:
-        pixels = jax.vmap(partial(advance, inside=inside), (0, 0, None, None, None))
-        samples = jax.vmap(pixels, (0, None, 0, by_sample, None))
-        every = jax.vmap(samples, (0, None, None, 0, 0))
-        return lambda paths: every(paths, lanes.pixel, lanes.sample, index, lanes.emission)
+        step = partial(advance, inside=inside)
+        pixels = jax.vmap(step, (0, 0, None, None, None, None, None))
+        samples = jax.vmap(pixels, (0, None, 0, None, by_sample, 0, None))
+        every = jax.vmap(samples, (0, None, None, 0, 0, 0, waves))
+        return lambda paths: every(
+            paths, lanes.pixel, lanes.sample, wave, index, weights, lanes.paint
+        )
 
-    if plan.balls > 1 or plan.nested:
+    if plan.scattering or plan.balls > 1 or plan.nested:
         return loop(every_path(None), paths, plan)
     # One ball apart from all else is entered once; after that its paths stay inside.
     paths = _unless_done(every_path(False), paths)

@@ -14,6 +14,30 @@ class Dielectric(eqx.Module):
     glass: Sellmeier = eqx.field(converter=lambda g: named_glass(g) if isinstance(g, str) else g)
 
 
+class Lambertian(eqx.Module):
+    """Matte: scatters light evenly, whatever way it is looked at.
+
+    Args:
+        texture: its albedo; a texture, or three numbers for one linear sRGB colour. Above 1 in a
+            channel a surface would give off more light than falls on it.
+    """
+
+    texture: Texture = eqx.field(converter=as_texture)
+
+
+class Metal(eqx.Module):
+    """A mirror, smooth or brushed.
+
+    Args:
+        texture: its reflectance; a texture, or three numbers for one linear sRGB colour.
+        fuzz: radius, ≥ 0, of the ball of which a uniform point is added to the unit vector of
+            the mirror direction. What then points below the surface is absorbed.
+    """
+
+    texture: Texture = eqx.field(converter=as_texture)
+    fuzz: Real = eqx.field(default=0.0, converter=real_array)
+
+
 class Emitter(eqx.Module):
     """A lamp that shines on both sides: radiance `intensity` × the colour of `texture`.
 
@@ -26,4 +50,4 @@ class Emitter(eqx.Module):
     intensity: Real = eqx.field(default=1.0, converter=real_array)
 
 
-Material = Dielectric | Emitter
+Material = Lambertian | Metal | Dielectric | Emitter

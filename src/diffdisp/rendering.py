@@ -1,11 +1,8 @@
-"""From a scene to a picture: chunks of pixels, threads, progress."""
+"""From a scene to a picture: passes, loops, progress."""
 
-import itertools
-import os
-import threading
-import warnings
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -13,52 +10,47 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from diffdisp.color import albedo_basis, wavelength_strata
-from diffdisp.dispersion import domain_error
+from diffdisp.chunks import (
+    WIDE_VECTORS,
+    RunNumbers,
+    Spectrum,
+    all_pixels,
+    check_glasses,
+    chunk_pixels,
+    film_paint,
+    film_range,
+    film_size,
+    film_spectrum,
+    glass_indices,
+    in_dtype,
+    in_threads,
+    over_chunks,
+    parts_of,
+    render_chunks,
+    render_chunks_jit,
+    run_numbers,
+    workers,
+)
 from diffdisp.film import Film
-from diffdisp.integrator import Lanes, emission_table, lane_radiance, world_tables
+from diffdisp.integrator import Tables, world_tables
 from diffdisp.planning import Plan, make_plan
-from diffdisp.sampling import sample_grid
-from diffdisp.scene import Scene, is_glass, object_glass, without_names
-from diffdisp.vector import Array, Real
+from diffdisp.scene import Scene, without_names
+from diffdisp.vector import Real
+from diffdisp.wavefront import (
+    LANES,
+    MOST_SAMPLES,
+    FilmSamples,
+    Tiles,
+    View,
+    tile_edge,
+    trace_tiles,
+    visible_tiles,
+)
 
-COLOR_RANGE = (0.38, 0.78)
-"""Wavelengths that a colour picture is made of, µm."""
+PASS_PATHS = 1 << 24
+"""Film samples of a pass over the picture: what a growing picture grows by, about a second."""
 
-CHUNKS_PER_CALL = 16
-"""Chunks that one call of the compiled program renders: what stopping and progress wait for."""
-
-
-class Pixels(NamedTuple):
-    """Pixels to render, in rows of one chunk each.
-
-    Args:
-        x: pixels to the right of the picture's left edge, of each one's own left edge.
-        y: pixels below the picture's upper edge, of each one's own upper edge.
-        number: uint32, for the low-discrepancy sequence.
-        size: edge of one, in pixels of the film; above 1 for coarse pictures.
-    """
-
-    x: Float[jax.Array | np.ndarray, "*chunks pixels"]
-    y: Float[jax.Array | np.ndarray, "*chunks pixels"]
-    number: jax.Array | np.ndarray
-    size: Float[jax.Array | np.ndarray, ""]
-
-
-class RunNumbers(NamedTuple):
-    """What else a run needs: its seed, when a path ends, and a 1 that no compiler knows."""
-
-    seed: np.ndarray
-    cutoff: np.ndarray
-    one: np.ndarray
-
-
-def run_numbers(plan: Plan, seed: int, cutoff: float | None = None) -> RunNumbers:
-    """Numbers of a run; without `cutoff` a path ends beneath the last digit of its light."""
-    least = 0.1 * float(np.finfo(plan.dtype).eps) if cutoff is None else cutoff
-    return RunNumbers(
-        np.asarray(seed % 2**32, np.uint32), np.asarray(least), np.asarray(1, np.int32)
-    )
+Progress = Callable[[int, int], None]
 
 
 def render(
@@ -69,7 +61,7 @@ def render(
     depth: int = 50,
     seed: int = 0,
     dtype: str | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Float[jax.Array | np.ndarray, "height width channels"]:
     """A picture of `scene`: radiance in bands, or linear sRGB.
 
@@ -81,9 +73,9 @@ def render(
         film: size, and bands or colour. Its wavelengths are constants.
         samples: film samples per pixel.
         depth: segments a path may have, the one from the camera included.
-        seed: of the choices that paths make among several glass balls; others make none.
+        seed: of the numbers that paths draw. A scene of lamps and one glass ball needs none.
         dtype: "float32" or "float64"; by default JAX's present one.
-        progress: called with the chunks done and their number after some have been done. An
+        progress: called with the parts done and their number after some have been done. An
             exception that it raises stops the work.
 
     Returns:
@@ -95,12 +87,57 @@ def render(
     traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(scene))
     if traced:
         return _picture(scene, film, samples, depth, seed, dtype)
+    knobs: dict[str, Any] = {"samples": samples, "depth": depth, "seed": seed, "dtype": dtype}
+    *_, last = render_progressively(scene, film, progress=progress, **knobs)
+    return last.radiance
+
+
+class Growing(NamedTuple):
+    """A picture on its way: its radiance (height, width, channels), and of how many samples."""
+
+    radiance: Float[np.ndarray, "height width channels"]
+    samples: int
+
+
+def render_progressively(
+    scene: Scene,
+    film: Film,
+    *,
+    samples: int = 16,
+    depth: int = 50,
+    seed: int = 0,
+    dtype: str | None = None,
+    progress: Progress | None = None,
+) -> Iterator[Growing]:
+    """The pictures that `render` passes through, each of more samples; the last is its own.
+
+    Each pass over the picture takes as many samples of every pixel as the others. A small picture
+    of few samples is done in one.
+
+    Args:
+        scene: as in `render`, without traced numbers.
+        film: as in `render`.
+        samples: as in `render`.
+        depth: as in `render`.
+        seed: as in `render`.
+        dtype: as in `render`.
+        progress: as in `render`, over all passes.
+
+    Raises:
+        ValueError: as in `render`.
+    """
     dtype = dtype or jnp.result_type(float).name
     check_glasses(scene, *film_range(film))
-    plan = make_plan(scene, film, samples, depth, dtype)
-    chunks, place = all_pixels(film, chunk_pixels(film, plan))
-    values = render_pixels(scene, film, plan, chunks, seed, progress)
-    return values.reshape(-1, film.channels)[place].reshape(film.height, film.width, film.channels)
+    work = _lay_out(scene, film, samples, depth, dtype)
+    total, passes = np.zeros((film.height, film.width, film.channels), dtype), len(work.cells)
+    for number in range(passes):
+
+        def tell(done: int, of: int, number: int = number) -> None:
+            if progress:
+                progress(number * of + done, passes * of)
+
+        total += _one_pass(work, film, seed, number, tell)
+        yield Growing(total / (number + 1), (number + 1) * work.plan.samples)
 
 
 def _picture(
@@ -109,119 +146,153 @@ def _picture(
     """`render` inside a transformation."""
     plan = make_plan(scene, film, samples, depth, dtype or jnp.result_type(float).name)
     chunks, place = all_pixels(film, chunk_pixels(film, plan))
-    values = _render_chunks(
+    values = render_chunks(
         plan, scene, film_spectrum(film, plan), film_size(film), chunks, run_numbers(plan, seed)
     )
     return values.reshape(-1, film.channels)[place].reshape(film.height, film.width, film.channels)
 
 
-def film_size(film: Film) -> tuple[np.ndarray, np.ndarray]:
-    """Width and height as numbers, so that another size is no other program."""
-    return np.asarray(float(film.width)), np.asarray(float(film.height))
-
-
-def film_range(film: Film) -> tuple[float, float]:
-    """Shortest and longest wavelength that a film sees, µm."""
-    if film.wavelengths is None:
-        return COLOR_RANGE
-    wavelengths = np.asarray(film.wavelengths)
-    return float(wavelengths.min()), float(wavelengths.max())
-
-
-def check_glasses(scene: Scene, low: float, high: float) -> None:
-    """Warn of wavelengths outside a glass's validity.
+class _Work(NamedTuple):
+    """What there is to do for a picture: passes, each of the plan's samples of every pixel.
 
     Args:
-        scene: the scene.
-        low: shortest wavelength, µm.
-        high: longest wavelength, µm.
-
-    Raises:
-        ValueError: a pole or n² ≤ 0 within [`low`, `high`].
+        plan: of one pass.
+        scene: without names.
+        spectrum: of the samples of all passes.
+        cells: (passes, samples) of the film, the samples' numbers.
+        tiles: what the wavefront goes through, in parts; None for the direct loop.
     """
-    for index, obj in enumerate(scene.objects):
-        if not is_glass(obj):
-            continue
-        glass = object_glass(scene, index)
-        called = obj.name or f"object[{index}]"
-        problem = domain_error(glass, low, high)
-        if problem:
-            raise ValueError(
-                f"{called}: its glass {problem}, within the bands' {low * 1e3:g}-{high * 1e3:g} nm"
-            )
-        valid = np.asarray(glass.validity) * 1e3
-        if low * 1e3 < valid[0] - 1e-6 or high * 1e3 > valid[1] + 1e-6:
-            warnings.warn(
-                f"{called}: bands {low * 1e3:g}-{high * 1e3:g} nm reach beyond the range"
-                f" {valid[0]:g}-{valid[1]:g} nm that its glass was measured on",
-                stacklevel=3,
-            )
+
+    plan: Plan
+    scene: Scene
+    spectrum: Spectrum
+    cells: np.ndarray
+    tiles: list[Tiles] | None
 
 
-def chunk_pixels(film: Film, plan: Plan) -> int:
-    """Pixels of a chunk: few enough that its paths stay in the cache, enough to fill a GPU."""
-    lanes = {"cpu": 2048}.get(jax.default_backend(), 1 << 18)
-    waves = plan.wavelengths_per_sample if film.wavelengths is None else film.channels
-    return int(np.clip(lanes // (plan.samples * (waves if plan.dispersive else 1)), 1, 1024))
+def _lay_out(scene: Scene, film: Film, samples: int, depth: int, dtype: str) -> _Work:
+    """The work for a picture."""
+    whole = make_plan(scene, film, samples, depth, dtype)
+    most = min(MOST_SAMPLES, PASS_PATHS // (film.width * film.height))
+    share = max(count for count in range(1, max(most, 1) + 1) if samples % count == 0)
+    plan = replace(whole, samples=share)
+    # Each pass takes cells from all over the pixel: a step that is no divisor of their number
+    # leads through all of them, and one near 0.382 of it keeps neighbours apart.
+    step = next(
+        k for k in range(round(samples * 0.382) or 1, samples + 1) if np.gcd(k, samples) == 1
+    )
+    cells = np.arange(samples) * (step if share < samples else 1) % samples
+    spectrum = film_spectrum(film, whole)
+    tiles = None
+    if plan.scattering:
+        if plan.bands and plan.dispersive:  # each band is a picture of its own
+            plan = replace(plan, bands=1)
+        tiles = visible_tiles(scene, film, plan, tile_edge(share), workers())
+    return _Work(plan, without_names(scene), spectrum, cells.reshape(-1, share), tiles)
 
 
-def all_pixels(film: Film, count: int) -> tuple[Pixels, np.ndarray]:
-    """Every pixel of a film in chunks of `count` that lie close together.
-
-    Returns:
-        The pixels, and for each pixel of the picture, row by row, its place among them. The last
-        chunk repeats its last pixel to be as long as the others.
-    """
-    return some_blocks(np.arange(film.width * film.height), film.width, 1.0, count)
-
-
-def some_blocks(
-    numbers: np.ndarray, width: int, size: float, count: int
-) -> tuple[Pixels, np.ndarray]:
-    """Square blocks of `size` pixels by their numbers, row by row of `width` blocks.
-
-    Args:
-        numbers: (blocks,) which blocks.
-        width: blocks in a row of the picture.
-        size: edge of a block, pixels.
-        count: blocks of a chunk.
-
-    Returns:
-        The blocks in chunks, those that lie close together in one, and the place (blocks,) of
-        each of `numbers` among them. The last chunk repeats its last block to be full.
-    """
-    tile = max(1, int(count**0.5))
-    y, x = np.divmod(numbers, width)
-    # Tiles of a chunk's size: paths that are alike end together.
-    order = np.lexsort((x % tile, y % tile, x // tile, y // tile))
-    place = np.empty_like(order)
-    place[order] = np.arange(len(order))
-    chunks = -(-len(order) // count)
-    order = np.append(order, np.repeat(order[-1], chunks * count - len(order)))
-    order = order.reshape(chunks, count)
-    return Pixels(
-        x[order] * size,
-        y[order] * size,
-        numbers[order].astype(np.uint32),
-        np.asarray(size),
-    ), place
+def _one_pass(
+    work: _Work, film: Film, seed: int, number: int, progress: Progress
+) -> Float[np.ndarray, "height width channels"]:
+    """The mean of the samples of one pass over the picture."""
+    plan, cells = work.plan, work.cells[number:]
+    run = run_numbers(plan, seed, cells=np.roll(work.cells, -number, axis=0))
+    spectrum = _of_pass(work.spectrum, cells[0], len(work.cells))
+    if work.tiles is not None:
+        return _wavefront_pass(work, film, spectrum, run, progress)
+    chunks, place = all_pixels(film, chunk_pixels(film, plan))
+    fixed = (plan, work.scene, spectrum, film_size(film))
+    values = over_chunks(
+        lambda part: np.asarray(render_chunks_jit(*fixed, part, run)), chunks, plan.dtype, progress
+    )
+    return values.reshape(-1, film.channels)[place].reshape(film.height, film.width, film.channels)
 
 
-def render_pixels(
-    scene: Scene,
-    film: Film,
+def _of_pass(spectrum: Spectrum, cells: np.ndarray, passes: int) -> Spectrum:
+    """The spectrum of the samples of one pass; what they count is over these alone."""
+    if spectrum.weights is None:
+        return spectrum
+    return Spectrum(spectrum.wavelengths[:, cells], None, spectrum.weights[:, cells] * passes)
+
+
+def _wavefront_pass(
+    work: _Work, film: Film, spectrum: Spectrum, run: RunNumbers, progress: Progress
+) -> Float[np.ndarray, "height width channels"]:
+    """One pass by the wavefront loop."""
+    plan, tiles = work.plan, work.tiles
+    assert tiles is not None
+    edge, size = tile_edge(plan.samples), film_size(film)
+    bands = [spectrum]
+    if plan.dispersive and spectrum.basis is not None:
+        pairs = zip(np.asarray(spectrum.wavelengths), np.asarray(spectrum.basis), strict=True)
+        bands = [Spectrum(wavelength[None], basis[None], None) for wavelength, basis in pairs]
+    rows, columns = -(-film.height // edge), -(-film.width // edge)
+    background = _background(work.scene, spectrum)
+    picture = np.empty((rows, edge, columns, edge, film.channels), plan.dtype)
+    picture[...] = background
+    jobs = [(band, part) for band in range(len(bands)) for part in range(len(tiles))]
+
+    def one(job: tuple[int, int]) -> None:
+        band, part = job[0], tiles[job[1]]
+        values = trace_jit(plan, edge, LANES, work.scene, bands[band], size, run, part)
+        shown = np.asarray(values)[: part.count]
+        channels = slice(band, band + 1) if len(bands) > 1 else slice(None)
+        across, down = part.x[: part.count] // edge, part.y[: part.count] // edge
+        picture[down, :, across, :, channels] = shown.reshape(-1, edge, edge, shown.shape[-1])
+
+    if jobs:
+        key = (plan, edge)
+        in_threads(one, jobs, plan.dtype, progress, alone=0 if key in _COMPILED else 1)
+        _COMPILED.add(key)
+    whole = picture.reshape(rows * edge, columns * edge, film.channels)
+    return whole[: film.height, : film.width]
+
+
+_COMPILED: set[tuple[Plan, int]] = set()
+
+
+def _background(scene: Scene, spectrum: Spectrum) -> np.ndarray:
+    """The background in the film's channels."""
+    color = np.asarray(scene.background.color)
+    return color if spectrum.basis is None else np.asarray(spectrum.basis) @ color
+
+
+def _trace(
     plan: Plan,
-    chunks: Pixels,
-    seed: int,
-    progress: Callable[[int, int], None] | None = None,
-) -> Float[np.ndarray, "chunks pixels channels"]:
-    """The pixels of a scene without traced numbers, on all cores."""
-    fixed = (plan, without_names(scene), film_spectrum(film, plan), film_size(film))
+    edge: int,
+    lanes: int,
+    scene: Scene,
+    spectrum: Spectrum,
+    size: tuple[Real, Real],
+    run: RunNumbers,
+    tiles: Tiles,
+) -> jax.Array:
+    """Mean radiance (tiles, pixels, channels) of some tiles."""
+    scene, spectrum, size, run = in_dtype((scene, spectrum, size, run), plan.dtype)
+    paint = film_paint(plan, scene, spectrum)
+    paint = paint._replace(
+        mean=tuple(channel[0] for channel in paint.mean),
+        half=tuple(channel[0] for channel in paint.half),
+    )
+    indices = glass_indices(scene, jnp.atleast_2d(spectrum.wavelengths))
+    weights = None
+    if spectrum.weights is not None:
+        weights = tuple(jnp.moveaxis(spectrum.weights, (2, 1, 0), (0, 1, 2)) * plan.samples)
+    samples = FilmSamples(
+        run.number,
+        run.right,
+        run.down,
+        run.cell,
+        jnp.stack(indices, axis=-1).swapaxes(0, 1) if indices else jnp.zeros((1, 1, 0)),
+        weights,
+    )
+    width, height = (edge.astype(jnp.int32) for edge in size)
+    tables = Tables(world_tables(scene), paint)
+    view = View(tables, scene.camera, width, height, run.seed, run.cutoff, run.one)
+    return trace_tiles(plan, edge, lanes, view, samples, tiles)
 
-    def run(part: Pixels) -> np.ndarray:
-        return np.asarray(_render_chunks_jit(*fixed, part, run_numbers(plan, seed)))
 
-    return over_chunks(run, chunks, plan.dtype, progress)
+trace_jit = partial(jax.jit, static_argnums=(0, 1, 2), compiler_options=WIDE_VECTORS)(_trace)
 
 
 def compile_ahead(scene: Scene, film: Film, *, samples: int, depth: int, dtype: str) -> None:
@@ -234,208 +305,16 @@ def compile_ahead(scene: Scene, film: Film, *, samples: int, depth: int, dtype: 
         depth: as in `render`.
         dtype: "float32" or "float64".
     """
-    plan = make_plan(scene, film, samples, depth, dtype)
-    chunks, _ = all_pixels(film, chunk_pixels(film, plan))
-    fixed = (plan, without_names(scene), film_spectrum(film, plan), film_size(film))
+    work = _lay_out(scene, film, samples, depth, dtype)
+    plan = work.plan
+    spectrum = _of_pass(work.spectrum, work.cells[0], len(work.cells))
+    run, size = run_numbers(plan, 0, cells=work.cells), film_size(film)
     with jax.enable_x64(dtype == "float64"):
-        first = next(parts_of(chunks))
-        _render_chunks_jit.lower(*fixed, first, run_numbers(plan, 0)).compile()
-
-
-def parts_of(chunks: Pixels) -> Iterator[Pixels]:
-    """The chunks in parts of equal length, so that one program serves all.
-
-    The last part repeats the last chunk.
-    """
-    total = len(chunks.x)
-    for start in range(0, total, CHUNKS_PER_CALL):
-        rows = np.minimum(np.arange(start, start + CHUNKS_PER_CALL), total - 1)
-        yield Pixels(chunks.x[rows], chunks.y[rows], chunks.number[rows], chunks.size)
-
-
-def over_chunks(
-    run: Callable[[Pixels], np.ndarray],
-    chunks: Pixels,
-    dtype: str,
-    progress: Callable[[int, int], None] | None = None,
-) -> np.ndarray:
-    """`run` over the parts of some chunks, a thread for each core; results joined in order.
-
-    XLA's CPU backend keeps to one core what a program does to a few thousand numbers at a time,
-    but threads may run it side by side.
-    """
-    stop = threading.Event()
-
-    def work(part: Pixels) -> np.ndarray:
-        if stop.is_set():
-            return np.empty(0)
-        # The switch for float64 belongs to a thread, not to the process.
-        with jax.enable_x64(dtype == "float64"):
-            return run(part)
-
-    parts, total, results = list(parts_of(chunks)), len(chunks.x), []
-    with ThreadPoolExecutor(min(_workers(), len(parts))) as pool:
-        try:
-            # The first alone: two threads at once would compile the same program twice.
-            first = [pool.submit(work, parts[0]).result()]
-            for result in itertools.chain(first, pool.map(work, parts[1:])):
-                results.append(result)
-                if progress:
-                    progress(min(len(results) * len(parts[0].x), total), total)
-        except BaseException:
-            stop.set()
-            raise
-    return np.concatenate(results, axis=0)[:total]
-
-
-def _workers() -> int:
-    """Threads that render: a core each; one where another device does the work."""
-    if jax.default_backend() != "cpu":
-        return 1
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-class Spectrum(NamedTuple):
-    """What a film asks of the spectrum, as numbers.
-
-    Args:
-        wavelengths: µm; (K,) one path for each band, (W, samples) wavelengths of colour samples,
-            (1,) without dispersion.
-        basis: (K, 3) what each band sees of a linear sRGB colour; None for a colour film.
-        weights: (W, samples, 3) what colour samples through glass count; None where all count
-            alike.
-    """
-
-    wavelengths: Float[jax.Array | np.ndarray, "..."]
-    basis: Float[jax.Array | np.ndarray, "bands 3"] | None
-    weights: Float[jax.Array | np.ndarray, "wavelengths samples 3"] | None
-
-
-def film_spectrum(film: Film, plan: Plan) -> Spectrum:
-    """The wavelengths that a film needs under a plan. They are constants, never traced."""
-    basis = None if film.wavelengths is None else albedo_basis(np.asarray(film.wavelengths))
-    if not plan.dispersive:
-        return Spectrum(np.array([sum(COLOR_RANGE) / 2]), basis, None)
-    if film.wavelengths is not None:
-        return Spectrum(np.asarray(film.wavelengths), basis, None)
-    count, samples = plan.wavelengths_per_sample, plan.samples
-    wavelengths, weights = wavelength_strata(count * samples)
-    # Each sample takes every `samples`-th stratum. A step near the golden section keeps the
-    # strata of neighbouring samples far apart.
-    step = next(
-        k for k in range(round(samples * 0.618) or 1, samples + 1) if np.gcd(k, samples) == 1
-    )
-    taken = np.arange(samples) * step % samples + np.arange(count)[:, None] * samples
-    return Spectrum(wavelengths[taken], None, weights[taken])
-
-
-def glass_indices(scene: Scene, wavelengths: Array) -> tuple[Array, ...]:
-    """The index of each ball's glass at every wavelength, in the order of the tracer's tables."""
-    glasses = [object_glass(scene, i) for i, obj in enumerate(scene.objects) if is_glass(obj)]
-    flat = wavelengths.reshape(-1)
-    return tuple(glass.indices(flat).reshape(wavelengths.shape) for glass in glasses)
-
-
-def chunk_lanes(
-    plan: Plan,
-    scene: Scene,
-    spectrum: Spectrum,
-    size: tuple[Real, Real],
-    pixels: Pixels,
-    run: RunNumbers,
-) -> Lanes:
-    """The film samples of one chunk of pixels.
-
-    Args:
-        plan: the static choices.
-        scene: the scene, in the plan's dtype.
-        spectrum: the film's spectrum under the plan.
-        size: width and height of the film, pixels.
-        pixels: one chunk, without the axis of chunks.
-        run: the other numbers.
-    """
-    columns, rows = sample_grid(plan.samples)
-    sample = np.arange(plan.samples)
-    cell = (pixels.size / columns, pixels.size / rows)
-    right = jnp.asarray(sample % columns + 0.5, plan.dtype)[:, None] * cell[0]
-    down = jnp.asarray(sample // columns + 0.5, plan.dtype)[:, None] * cell[1]
-    emission = emission_table(scene)
-    if plan.dispersive and spectrum.basis is not None:
-        emission = jax.tree.map(lambda table: (spectrum.basis @ table.T)[:, :, None], emission)
-    else:
-        waves = spectrum.wavelengths.shape[0]
-        emission = jax.tree.map(
-            lambda table: jnp.broadcast_to(table[None], (waves, *table.shape)), emission
-        )
-    return Lanes(
-        world_tables(scene),
-        emission,
-        spectrum.weights,
-        scene.camera,
-        size[1],
-        (0.5 * size[0], 0.5 * size[1]),
-        cell,
-        pixels.x[None, :] + right,
-        pixels.y[None, :] + down,
-        pixels.number,
-        jnp.asarray(sample, jnp.uint32),
-        run.seed,
-        run.cutoff,
-        run.one,
-    )
-
-
-def combine(
-    lanes: Float[Array, "wavelengths samples pixels channels"], spectrum: Spectrum
-) -> Float[Array, "pixels film_channels"]:
-    """The film's channels of each pixel, from what its lanes add."""
-    if spectrum.weights is not None:
-        return jnp.sum(lanes, axis=(0, 1))
-    if lanes.shape[-1] == 1:
-        return lanes[:, 0, :, 0].T
-    return lanes[0, 0] if spectrum.basis is None else lanes[0, 0] @ spectrum.basis.T
-
-
-def _render_chunks(
-    plan: Plan,
-    scene: Scene,
-    spectrum: Spectrum,
-    size: tuple[Real, Real],
-    chunks: Pixels,
-    run: RunNumbers,
-) -> Float[jax.Array, "chunks pixels channels"]:
-    """Mean radiance of each pixel, one chunk after another."""
-    scene, spectrum, size, chunks, run = in_dtype((scene, spectrum, size, chunks, run), plan.dtype)
-    indices = glass_indices(scene, spectrum.wavelengths)
-
-    def chunk(pixels: Pixels) -> Array:
-        lanes = chunk_lanes(plan, scene, spectrum, size, pixels, run)
-        return combine(lane_radiance(plan, indices, lanes), spectrum)
-
-    return each_chunk(chunk, chunks)
-
-
-def each_chunk(chunk: Callable[[Pixels], Array], chunks: Pixels) -> jax.Array:
-    """`chunk` of one chunk after another."""
-    return jax.lax.map(
-        lambda row: chunk(Pixels(row[0], row[1], row[2], chunks.size)),
-        (chunks.x, chunks.y, chunks.number),
-    )
-
-
-def in_dtype(tree: Any, dtype: str) -> Any:
-    """The tree with its real numbers in `dtype`; whole numbers stay as they are."""
-
-    def cast(leaf: jax.Array | np.ndarray) -> jax.Array:
-        real = jnp.issubdtype(leaf.dtype, jnp.floating)
-        return jnp.asarray(leaf, dtype) if real else jnp.asarray(leaf)
-
-    return jax.tree.map(cast, tree)
-
-
-WIDE_VECTORS = {"xla_cpu_prefer_vector_width": "512"}
-"""Compiler option for our own programs: a third less time where the processor has AVX-512."""
-
-_render_chunks_jit = jax.jit(_render_chunks, static_argnums=0, compiler_options=WIDE_VECTORS)
+        if work.tiles is None:
+            chunks, _ = all_pixels(film, chunk_pixels(film, plan))
+            part = next(parts_of(chunks))
+            render_chunks_jit.lower(plan, work.scene, spectrum, size, part, run).compile()
+        elif work.tiles:
+            edge = tile_edge(plan.samples)
+            tiles = work.tiles[0]
+            trace_jit.lower(plan, edge, LANES, work.scene, spectrum, size, run, tiles).compile()

@@ -7,8 +7,8 @@ import equinox as eqx
 from diffdisp.camera import Camera
 from diffdisp.dispersion import Sellmeier, real_array
 from diffdisp.geometry import Plane, Sphere
-from diffdisp.material import Dielectric, Emitter, Material
-from diffdisp.texture import Checker2D
+from diffdisp.material import Dielectric, Material
+from diffdisp.texture import Checker2D, Texture
 from diffdisp.vector import Triple
 
 
@@ -63,14 +63,15 @@ def as_tuple(objects: Iterable[Object]) -> tuple[Object, ...]:
 def pairing_error(shape: object, material: object) -> str | None:
     """Why this shape cannot be made of this material; None where it can."""
     if isinstance(shape, Plane) and isinstance(material, Dielectric):
-        return "a plane cannot be glass: allowed on a plane is an emitter"
-    if (
-        isinstance(shape, Sphere)
-        and isinstance(material, Emitter)
-        and isinstance(material.texture, Checker2D)
-    ):
-        return "a sphere cannot carry a checker2d: allowed on a sphere is a solid texture"
+        return "a plane cannot be glass: allowed on a plane are lambertian, metal and emitter"
+    if isinstance(shape, Sphere) and isinstance(texture_of(material), Checker2D):
+        return "a sphere cannot carry a checker2d: allowed on a sphere are solid and checker"
     return None
+
+
+def texture_of(material: object) -> Texture | None:
+    """The texture of a material; None of glass, which has none."""
+    return getattr(material, "texture", None)
 
 
 def is_glass(obj: Object) -> bool:

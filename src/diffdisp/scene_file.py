@@ -5,6 +5,7 @@ import json
 import math
 import os
 import re
+import sys
 import tomllib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -29,9 +30,9 @@ from diffdisp.dispersion import Sellmeier
 from diffdisp.geometry import Plane, Sphere
 from diffdisp.glasses import named_glass
 from diffdisp.image import replacing
-from diffdisp.material import Dielectric, Emitter, Material
+from diffdisp.material import Dielectric, Emitter, Lambertian, Material, Metal
 from diffdisp.scene import Background, Object, Scene, pairing_error
-from diffdisp.texture import Checker2D, Solid, Texture
+from diffdisp.texture import Checker, Checker2D, Solid, Texture
 
 KeyPath = tuple[str | int, ...]
 """Where a value stands in a file: `("object", 1, "shape", "radius")`."""
@@ -88,12 +89,16 @@ _COLOR = "three finite numbers ≥ 0"
 _Color = Annotated[
     list[Annotated[float, Field(ge=0)]], Field(min_length=3, max_length=3, description=_COLOR)
 ]
+_ALBEDO = "three finite numbers from 0 to 1"
 _Length = Annotated[float, Field(gt=0, description="a finite number > 0")]
+_Factor = Annotated[float, Field(ge=0, description="a finite number ≥ 0")]
 
 _SHAPES = "sphere, plane"
-_MATERIALS = "dielectric, emitter"
-_TEXTURES = "solid, checker2d"
+_MATERIALS = "lambertian, metal, dielectric, emitter"
+_TEXTURES = "solid, checker, checker2d"
 _KINDS = {"shape": _SHAPES, "material": _MATERIALS, "texture": _TEXTURES}
+_SCATTERING = {"type=lambertian", "type=metal"}
+"""The materials whose colours are albedos: above 1 they would create light."""
 
 
 def _tag(value: object) -> str | None:
@@ -117,7 +122,11 @@ class _Table(BaseModel):
 
     def arguments(self) -> dict[str, Any]:
         """What the file gives, for the constructor; the rest has the constructor's default."""
-        return {name: getattr(self, name) for name in self.model_fields_set if name != "type"}
+        values = {name: getattr(self, name) for name in self.model_fields_set if name != "type"}
+        return {
+            name: value.build() if isinstance(value, _Solid | _Checker | _Checker2D) else value
+            for name, value in values.items()
+        }
 
 
 class _Camera(_Table):
@@ -193,6 +202,18 @@ class _Solid(_Table):
         return Solid(**self.arguments())
 
 
+class _Checker(_Table):
+    """Cubes in space."""
+
+    type: Literal["checker"]
+    even: _Color
+    odd: _Color
+    scale: _Length = 10.0
+
+    def build(self) -> Checker:
+        return Checker(**self.arguments())
+
+
 class _Checker2D(_Table):
     """Square tiles on a plane."""
 
@@ -203,6 +224,39 @@ class _Checker2D(_Table):
 
     def build(self) -> Checker2D:
         return Checker2D(**self.arguments())
+
+
+_Texture = Annotated[
+    Annotated[_Solid, Tag("type=solid")]
+    | Annotated[_Checker, Tag("type=checker")]
+    | Annotated[_Checker2D, Tag("type=checker2d")]
+    | Annotated[_Color, Tag("color")],
+    Discriminator(_tag),
+]
+_A_TEXTURE_TABLE = f"or a table whose type is one of {_TEXTURES}"
+_Albedo = Annotated[_Texture, Field(description=f"{_ALBEDO}, {_A_TEXTURE_TABLE}")]
+_Emission = Annotated[_Texture, Field(description=f"{_COLOR}, {_A_TEXTURE_TABLE}")]
+
+
+class _Lambertian(_Table):
+    """Matte."""
+
+    type: Literal["lambertian"]
+    texture: _Albedo
+
+    def build(self) -> Lambertian:
+        return Lambertian(**self.arguments())
+
+
+class _Metal(_Table):
+    """A mirror."""
+
+    type: Literal["metal"]
+    texture: _Albedo
+    fuzz: _Factor = 0.0
+
+    def build(self) -> Metal:
+        return Metal(**self.arguments())
 
 
 class _NamedDielectric(_Table):
@@ -241,18 +295,11 @@ class _Emitter(_Table):
     """A lamp."""
 
     type: Literal["emitter"]
-    texture: Annotated[
-        Annotated[_Solid, Tag("type=solid")]
-        | Annotated[_Checker2D, Tag("type=checker2d")]
-        | Annotated[_Color, Tag("color")],
-        Field(description=f"{_COLOR}, or a table whose type is one of {_TEXTURES}"),
-        Discriminator(_tag),
-    ]
-    intensity: Annotated[float, Field(ge=0, description="a finite number ≥ 0")] = 1.0
+    texture: _Emission
+    intensity: _Factor = 1.0
 
     def build(self) -> Emitter:
-        texture = self.texture if isinstance(self.texture, list) else self.texture.build()
-        return Emitter(**{**self.arguments(), "texture": texture})
+        return Emitter(**self.arguments())
 
 
 class _Object(_Table):
@@ -265,7 +312,9 @@ class _Object(_Table):
         Discriminator(_tag),
     ]
     material: Annotated[
-        Annotated[_NamedDielectric, Tag("glass by name")]
+        Annotated[_Lambertian, Tag("type=lambertian")]
+        | Annotated[_Metal, Tag("type=metal")]
+        | Annotated[_NamedDielectric, Tag("glass by name")]
         | Annotated[_Dielectric, Tag("type=dielectric")]
         | Annotated[_Emitter, Tag("type=emitter")],
         Field(description=f"a table whose type is one of {_MATERIALS}"),
@@ -301,7 +350,10 @@ _TABLES: dict[str, type[_Table]] = {
     "type=sphere": _Sphere,
     "type=plane": _Plane,
     "type=solid": _Solid,
+    "type=checker": _Checker,
     "type=checker2d": _Checker2D,
+    "type=lambertian": _Lambertian,
+    "type=metal": _Metal,
     "glass by name": _NamedDielectric,
     "type=dielectric": _Dielectric,
     "type=emitter": _Emitter,
@@ -383,7 +435,7 @@ def _syntax_message(error: Exception, text: str, file_name: str) -> str:
 
 def _checked(data: dict[str, Any]) -> tuple[_Scene | None, list[_Problem]]:
     """The checked tables, or None and all that is wrong with them."""
-    problems = [*_pairing_problems(data), *_name_problems(data)]
+    problems = [*_pairing_problems(data), *_name_problems(data), *_albedo_problems(data)]
     try:
         table = _Scene.model_validate(data)
     except ValidationError as error:
@@ -415,6 +467,25 @@ def _name_problems(data: dict[str, Any]) -> Iterator[_Problem]:
             yield _Problem(("object", index, "name"), text)
 
 
+def _albedo_problems(data: dict[str, Any]) -> Iterator[_Problem]:
+    """Channels above 1 of materials that give no light of their own."""
+    for index, table in _raw_objects(data):
+        material = table.get("material")
+        if not isinstance(material, dict) or _tag(material) not in _SCATTERING:
+            continue
+        texture = material.get("texture")
+        colors: dict[KeyPath, Any] = {(): texture}
+        if isinstance(texture, dict):
+            colors = {(name,): texture.get(name) for name in ("color", "even", "odd")}
+        for place, color in colors.items():
+            triple = color if isinstance(color, list) and len(color) == 3 else []
+            for channel, value in enumerate(triple):
+                # Beyond the largest float a number is not finite, which is told already.
+                if isinstance(value, int | float) and 1 < value <= sys.float_info.max:
+                    path = ("object", index, "material", "texture", *place, channel)
+                    yield _Problem(path, f"found {_found(value)}; allowed: {_ALBEDO}")
+
+
 # Whether a shape goes with a material depends on their types only: one of each stands for all.
 _A_SHAPE = {
     "type=sphere": Sphere(np.zeros(3), np.ones(())),
@@ -423,8 +494,10 @@ _A_SHAPE = {
 _A_TEXTURE: dict[str | None, Texture] = {
     "color": Solid(np.zeros(3)),
     "type=solid": Solid(np.zeros(3)),
+    "type=checker": Checker(np.zeros(3), np.zeros(3)),
     "type=checker2d": Checker2D(np.zeros(3), np.zeros(3), np.ones(())),
 }
+_TEXTURED = {"type=lambertian": Lambertian, "type=metal": Metal, "type=emitter": Emitter}
 
 
 def _a_material(table: Any) -> Material | None:
@@ -432,8 +505,9 @@ def _a_material(table: Any) -> Material | None:
     kind = _tag(table)
     if kind in ("type=dielectric", "glass by name"):
         return Dielectric(Sellmeier(np.zeros(3), np.zeros(3)))
-    texture = _A_TEXTURE.get(_tag(table.get("texture"))) if kind == "type=emitter" else None
-    return Emitter(texture, np.ones(())) if texture else None
+    textured = _TEXTURED.get(kind or "")
+    texture = _A_TEXTURE.get(_tag(table.get("texture"))) if textured else None
+    return textured(texture) if textured and texture else None
 
 
 def _pairing_problems(data: dict[str, Any]) -> Iterator[_Problem]:
@@ -457,8 +531,10 @@ def _problem(error: ErrorDetails) -> _Problem:
         return _Problem(path, _extra_text(owner, field))
     if error["type"] in ("union_tag_invalid", "union_tag_not_found") and isinstance(found, dict):
         kind = f"found {_found(found['type'])}; allowed" if "type" in found else "missing; required"
-        return _Problem((*path, "type"), f"{kind}: {_KINDS[field].replace(', ', ' or ')}")
+        return _Problem((*path, "type"), f"{kind}: {' or '.join(_KINDS[field].rsplit(', ', 1))}")
     allowed = _COLOR if owner == "texture" else _TABLES[owner].model_fields[field].description
+    if allowed == _COLOR and not _SCATTERING.isdisjoint(names):
+        allowed = _ALBEDO
     if error["type"] == "missing":
         return _Problem(path, f"missing; required: {allowed}")
     if error["type"] == "value_error":
@@ -657,7 +733,7 @@ def _module_table(module: Sphere | Plane | Material | Texture) -> dict[str, Any]
     kind = {"type": type(module).__name__.lower()}
     if isinstance(module, Dielectric):
         return {**kind, **_glass_table(module.glass)}
-    if isinstance(module, Emitter):
+    if isinstance(module, Lambertian | Metal | Emitter):
         return {**kind, **_arguments(module), "texture": _module_table(module.texture)}
     return {**kind, **_arguments(module)}
 

@@ -29,12 +29,26 @@ class Checker2D(eqx.Module):
     tile: Real = eqx.field(converter=real_array)
 
 
-Texture = Solid | Checker2D
+class Checker(eqx.Module):
+    """Cubes in space: `even` where sin(s·x)·sin(s·y)·sin(s·z) ≥ 0, else `odd`.
+
+    Args:
+        even: linear sRGB.
+        odd: linear sRGB.
+        scale: s, radians per scene unit, > 0; a cube's edge is π/s.
+    """
+
+    even: Triple = eqx.field(converter=real_array)
+    odd: Triple = eqx.field(converter=real_array)
+    scale: Real = eqx.field(default=10.0, converter=real_array)
+
+
+Texture = Solid | Checker | Checker2D
 
 
 def as_texture(value: Any) -> Texture:
     """A texture as it is; three numbers as the `Solid` they abbreviate."""
-    if isinstance(value, Solid | Checker2D):
+    if isinstance(value, Texture):
         return value
     return Solid(value)
 

@@ -1,0 +1,446 @@
+"""Many paths at once: lanes that are kept busy, for pictures of scenes that scatter light.
+
+A few thousand lanes advance together, so that their numbers stay in the cache. A first pass finds
+what each film sample meets, tile by tile, among the spheres that the tile can see; what ends there
+is done. Each lane then owns a pixel until its other samples are done, and takes the next pixel of
+a queue when enough lanes have nothing left to do.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int, UInt32
+
+from diffdisp.camera import Camera, camera_ray
+from diffdisp.film import Film
+from diffdisp.geometry import Ray, Sphere
+from diffdisp.integrator import (
+    Candidates,
+    Path,
+    Setting,
+    Tables,
+    bounce,
+    emitted,
+    nearest,
+    new_path,
+    no_surface,
+    once,
+    surface_numbers,
+    surfaces_of,
+)
+from diffdisp.planning import Plan
+from diffdisp.sampling import Numbers
+from diffdisp.scene import Scene
+from diffdisp.vector import Array, Real, Vec3, choose, vec3
+
+LANES = 2048
+"""Lanes that advance together: their state stays in the cache of a core."""
+
+IDLE = 1 / 3
+"""Share of lanes that may idle before they are given new pixels."""
+
+GROUP = 4
+"""Spheres that the first pass takes together."""
+
+MOST_SAMPLES = 32
+"""Samples of a pixel in one pass: those that wait are bits of a word."""
+
+
+PIXELS = 1 << 17
+"""Pixels that one call of the compiled program has room for."""
+
+
+class Tiles(NamedTuple):
+    """Square tiles of a picture to render, and what each can see.
+
+    Args:
+        x: pixels to the right of the picture's left edge.
+        y: pixels below its upper edge.
+        candidates: rows of the table of spheres that a tile can see, filled up with one past its
+            last row.
+        groups: how many groups of four candidates count.
+        count: how many tiles there are; the others fill the table.
+    """
+
+    x: Int[Array, " tiles"]
+    y: Int[Array, " tiles"]
+    candidates: Int[Array, "tiles rows"]
+    groups: Int[Array, " tiles"]
+    count: Int[Array, ""]
+
+
+class FilmSamples(NamedTuple):
+    """The samples of every pixel in one pass.
+
+    Args:
+        number: which of the pixel's samples, of all passes.
+        right: from the pixel's left edge to that of the sample's cell, pixels.
+        down: from its upper edge to that of the cell, pixels.
+        cell: width and height of a cell, pixels.
+        indices: of each ball's glass, for each sample's wavelengths; of one where all have one.
+        weights: what the paths at each of a sample's wavelengths count, for each channel; over
+            all of them the mean of a pass's samples is about 1. None where none has a wavelength.
+    """
+
+    number: UInt32[Array, " samples"]
+    right: Float[Array, " samples"]
+    down: Float[Array, " samples"]
+    cell: tuple[Real, Real]
+    indices: Float[Array, "samples wavelengths balls"]
+    weights: tuple[Float[Array, "samples wavelengths"], ...] | None
+
+
+class View(NamedTuple):
+    """A scene and a film, as the wavefront sees them; sizes in pixels, `one` as in `once`."""
+
+    tables: Tables
+    camera: Camera
+    width: Int[Array, ""]
+    height: Int[Array, ""]
+    seed: Array
+    cutoff: Real
+    one: Array
+
+
+class Lane(NamedTuple):
+    """A lane: the pixel that it owns, and the path of one of its samples.
+
+    Args:
+        slot: where the pixel's result belongs.
+        x: the pixel's column.
+        y: its row.
+        waiting: a bit for each sample that is still to come.
+        sample: the present one.
+        wave: the present one of the sample's wavelengths.
+        waves_left: how many of them are still to come; None where none has any.
+        path: the present path; its radiance is that of all the pixel's paths.
+    """
+
+    slot: Int[Array, ""]
+    x: Int[Array, ""]
+    y: Int[Array, ""]
+    waiting: UInt32[Array, ""]
+    sample: Int[Array, ""]
+    wave: Int[Array, ""]
+    waves_left: Int[Array, ""] | None
+    path: Path
+
+
+def tile_edge(samples: int) -> int:
+    """Pixels along the edge of a tile: a power of two, for two or three thousand samples."""
+    return 1 << max(round(np.log2(4096 / samples) / 2), 2)
+
+
+def visible_tiles(scene: Scene, film: Film, plan: Plan, edge: int, workers: int) -> list[Tiles]:
+    """The tiles of a picture in which there is more to see than the background, in parts.
+
+    Args:
+        scene: without traced numbers.
+        film: the picture's size.
+        plan: the static choices.
+        edge: of a tile, pixels.
+        workers: how many parts are worked on at a time.
+    """
+    spheres = [obj.shape for obj in surfaces_of(scene) if isinstance(obj.shape, Sphere)]
+    x, y = np.meshgrid(np.arange(0, film.width, edge), np.arange(0, film.height, edge))
+    x, y = x.reshape(-1), y.reshape(-1)
+    seen = _in_view(scene.camera, film, spheres, x, y, edge)
+    some = np.flatnonzero(seen.any(axis=1) | (plan.planes > 0))
+    counts = seen.sum(axis=1)
+    # The rows of those that are seen come first, the others after them.
+    rows = np.argsort(~seen, axis=1, kind="stable")
+    width = -(-len(spheres) // GROUP) * GROUP
+    rows = np.where(np.arange(len(spheres)) < counts[:, None], rows, len(spheres))
+    rows = np.pad(rows, ((0, 0), (0, width - len(spheres))), constant_values=len(spheres))
+    capacity = max(1, PIXELS // edge**2)
+    # Equal parts, a multiple of the workers', each with room for all lanes.
+    parts = min(-(-len(some) // (capacity * workers)) * workers, len(some))
+
+    def part(of: np.ndarray) -> Tiles:
+        spare = (0, capacity - len(of))
+        return Tiles(
+            np.pad(x[of], spare).astype(np.int32),
+            np.pad(y[of], spare).astype(np.int32),
+            np.pad(rows[of], (spare, (0, 0))).astype(np.int32),
+            np.pad(-(-counts[of] // GROUP), spare).astype(np.int32),
+            np.asarray(len(of), np.int32),
+        )
+
+    return [part(of) for of in np.array_split(some, parts)] if parts else []
+
+
+def _in_view(
+    camera: Camera, film: Film, spheres: list[Sphere], x: np.ndarray, y: np.ndarray, edge: int
+) -> np.ndarray:
+    """Whether each sphere may be seen in each tile: a cone around the tile meets one around it."""
+    look_from = np.asarray(camera.look_from)
+    forward = _unit(np.asarray(camera.look_at) - look_from)
+    right = _unit(np.cross(forward, np.asarray(camera.up)))
+    upward = np.cross(right, forward)
+    pixel = np.tan(np.radians(np.asarray(camera.vertical_fov)) / 2) * 2 / film.height
+
+    def toward(dx: float, dy: float) -> np.ndarray:
+        across = (x + dx - film.width / 2) * pixel
+        down = (y + dy - film.height / 2) * pixel
+        return _unit(forward + right * across[:, None] - upward * down[:, None])
+
+    axis = toward(edge / 2, edge / 2)
+    corners = [toward(dx, dy) for dx in (0, edge) for dy in (0, edge)]
+    cosine = np.min([np.sum(axis * corner, axis=1) for corner in corners], axis=0)[:, None]
+    if not spheres:
+        return np.zeros((len(x), 0), bool)
+    offset = np.stack([np.asarray(s.center) for s in spheres]) - look_from
+    distance = np.linalg.norm(offset, axis=1)
+    radius = np.array([float(np.asarray(s.radius)) for s in spheres]) * (1 + 1e-4)
+    around = distance <= radius
+    sine = np.where(around, 1.0, radius / np.where(around, 1.0, distance))
+    # Both cones meet where the angle between their axes is at most the sum of their own.
+    widest = cosine * np.sqrt(1 - sine**2) - np.sqrt(1 - cosine**2) * sine
+    behind = np.arccos(cosine) + np.arcsin(sine) >= np.pi
+    return around | behind | (axis @ offset.T >= distance * (widest - 1e-6))
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def trace_tiles(
+    plan: Plan, edge: int, lanes: int, view: View, samples: FilmSamples, tiles: Tiles
+) -> Float[jax.Array, "tiles pixels channels"]:
+    """The mean radiance of each pixel of some tiles over the samples of one pass.
+
+    Args:
+        plan: the static choices; `plan.samples` are those of a pass.
+        edge: of a tile, pixels.
+        lanes: how many advance together. They change nothing but the time.
+        view: scene and film.
+        samples: of each pixel.
+        tiles: which pixels.
+    """
+    shown, waiting, hits = _first_hits(plan, edge, view, samples, tiles)
+    pixels = waiting.shape[0]
+    place = jnp.cumsum((waiting != 0).astype(jnp.int32)) - 1
+    queue = jnp.zeros(pixels + 1, jnp.int32)
+    queue = queue.at[jnp.where(waiting != 0, place, pixels)].set(np.arange(pixels, dtype=np.int32))
+    collected = _follow(
+        plan, edge, lanes, view, samples, tiles, waiting, hits, queue, place[-1] + 1
+    )
+    total = [s + c[:-1] for s, c in zip(shown, collected, strict=True)]
+    return jnp.stack(total, axis=-1).reshape(-1, edge * edge, len(total)) * (1.0 / plan.samples)
+
+
+def _sample_ray(plan: Plan, view: View, samples: FilmSamples, x: Array, y: Array, s: Array) -> Ray:
+    """The camera ray of sample `s` of the pixel in column `x` and row `y`."""
+    numbers, pixel = _numbers(plan, view), _pixel_number(view, x, y)
+    word = samples.number[s]
+    across, down = (numbers.of_film(pixel, word, axis) for axis in (0, 1))
+    middle = (0.5 * view.width.astype(plan.dtype), 0.5 * view.height.astype(plan.dtype))
+    return camera_ray(
+        view.camera,
+        view.height.astype(plan.dtype),
+        x.astype(plan.dtype) + (samples.right[s] + across * samples.cell[0]),
+        y.astype(plan.dtype) + (samples.down[s] + down * samples.cell[1]),
+        middle,
+    )
+
+
+def _numbers(plan: Plan, view: View) -> Numbers:
+    return Numbers(plan.numbers_per_bounce, view.seed, plan.dtype)
+
+
+def _pixel_number(view: View, x: Array, y: Array) -> Array:
+    return (y * view.width + x).astype(jnp.uint32)
+
+
+def _first_hits(
+    plan: Plan, edge: int, view: View, samples: FilmSamples, tiles: Tiles
+) -> tuple[list[Array], Array, Array]:
+    """What the camera sees.
+
+    Returns:
+        For each pixel the sum of what its samples see that end at once, a list of channels; a bit
+        for each sample that goes on; and for (pixel, sample) in one axis the surface it meets.
+    """
+    size, capacity = edge * edge, tiles.x.shape[0]
+    y, x = np.divmod(np.arange(size, dtype=np.int32), np.int32(edge))
+    world = view.tables.world
+    # A sphere of no size for the rows that only fill the groups.
+    centers = Vec3(*(jnp.append(axis, 0.0) for axis in world.centers))
+    radii = jnp.append(world.radii, 0.0)
+    numbers = jnp.asarray(np.append(surface_numbers(plan)[0], 0))
+
+    def see(tile: Array) -> tuple[tuple[Array, ...], Array, Array]:
+        rows = tiles.candidates[tile]
+        spheres = Candidates(
+            Vec3(*(axis[rows] for axis in centers)),
+            radii[rows],
+            numbers[rows],
+            tiles.groups[tile],
+            GROUP,
+        )
+
+        def one_sample(x: Array, y: Array, s: Array) -> tuple[tuple[Real, ...], Array]:
+            ray = once(lambda: _sample_ray(plan, view, samples, x, y, s), view.one)
+            surface = nearest(ray, world, plan, no_surface(ray.origin.x), spheres)
+            path = new_path(ray, None, surface, plan)
+            shown = emitted(surface, path, view.tables, plan)
+            ends = surface >= plan.first_lamp
+            shown = tuple(jnp.where(ends, channel, 0.0) for channel in shown)
+            return shown, jnp.where(path.alive, surface, -1)
+
+        of_pixel = jax.vmap(one_sample, (None, None, 0))
+        column, row = tiles.x[tile] + x, tiles.y[tile] + y
+        shown, surface = jax.vmap(of_pixel, (0, 0, None))(column, row, np.arange(plan.samples))
+        inside = (column < view.width) & (row < view.height)
+        bits = np.uint32(1) << np.arange(plan.samples, dtype=np.uint32)
+        goes_on = (surface >= 0) & inside[:, None]
+        waiting = jnp.sum(jnp.where(goes_on, bits, np.uint32(0)), axis=-1, dtype=jnp.uint32)
+        return tuple(jnp.sum(channel, axis=-1) for channel in shown), waiting, surface.reshape(-1)
+
+    def put(tile: Array, results: Any) -> Any:
+        def at(whole: Array, part: Array) -> Array:
+            return jax.lax.dynamic_update_slice(whole, part, (tile * part.shape[0],))
+
+        return jax.tree.map(at, results, see(tile))
+
+    empty = (
+        tuple(jnp.zeros(capacity * size, plan.dtype) for _ in range(plan.channels)),
+        jnp.zeros(capacity * size, jnp.uint32),
+        jnp.zeros(capacity * size * plan.samples, jnp.int32),
+    )
+    shown, waiting, hits = jax.lax.fori_loop(0, tiles.count, put, empty)
+    return list(shown), waiting, hits
+
+
+def _follow(
+    plan: Plan,
+    edge: int,
+    lanes: int,
+    view: View,
+    samples: FilmSamples,
+    tiles: Tiles,
+    waiting: UInt32[Array, " pixels"],
+    hits: Int[Array, " pixel_samples"],
+    queue: Int[Array, " places"],
+    length: Int[Array, ""],
+) -> tuple[Array, ...]:
+    """The sum of each pixel's samples that went on, a channel each, with a place to spare."""
+    pixels = waiting.shape[0]
+    advance = jax.vmap(lambda lane: _advance(lane, plan, view, samples, hits))
+
+    def busy(lane: Lane) -> Array:
+        more = lane.path.alive | (lane.waiting != 0)
+        return more if lane.waves_left is None else more | (lane.waves_left > 0)
+
+    def collect(lane: Lane, results: tuple[Array, ...]) -> tuple[Array, ...]:
+        slot = jnp.where(busy(lane), pixels, lane.slot)
+        pairs = zip(results, lane.path.radiance, strict=True)
+        return tuple(whole.at[slot].set(value) for whole, value in pairs)
+
+    def refill(lane: Lane, taken: Array) -> tuple[Lane, Array]:
+        idle = ~busy(lane)
+        place = taken + jnp.cumsum(idle.astype(jnp.int32)) - 1
+        fresh = idle & (place < length)
+        slot = queue[jnp.where(fresh, place, pixels)]
+        tile, pixel = slot // (edge * edge), slot % (edge * edge)
+        renewed = lane._replace(
+            slot=slot,
+            x=tiles.x[tile] + pixel % edge,
+            y=tiles.y[tile] + pixel // edge,
+            waiting=waiting[slot],
+            path=lane.path._replace(radiance=tuple(jnp.zeros_like(r) for r in lane.path.radiance)),
+        )
+        # What idles for good writes its result once more, to a place that nobody reads.
+        rested = lane._replace(slot=jnp.where(idle, pixels, lane.slot))
+        taken = jnp.minimum(taken + jnp.sum(idle.astype(jnp.int32)), length)
+        return choose(fresh, renewed, rested), taken
+
+    def turn(state: tuple[Lane, tuple[Array, ...], Array]) -> tuple[Lane, tuple[Array, ...], Array]:
+        lane, results, taken = state
+        results = collect(lane, results)
+        lane, taken = refill(lane, taken)
+        least = jnp.where(taken < length, int(lanes * (1 - IDLE)), 0)
+        lane = jax.lax.while_loop(
+            lambda lane: jnp.sum(busy(lane).astype(jnp.int32)) > least, advance, lane
+        )
+        return lane, results, taken
+
+    def unfinished(state: tuple[Lane, tuple[Array, ...], Array]) -> Array:
+        return (state[2] < length) | jnp.any(busy(state[0]))
+
+    results = tuple(jnp.zeros(pixels + 1, plan.dtype) for _ in range(plan.channels))
+    none = jnp.zeros((), jnp.int32)
+    lane, results, _ = jax.lax.while_loop(
+        unfinished, turn, (_idle_lanes(plan, lanes, pixels, view), results, none)
+    )
+    return collect(lane, results)
+
+
+def _idle_lanes(plan: Plan, lanes: int, sink: int, view: View) -> Lane:
+    """Lanes without a pixel."""
+    zero, real = jnp.zeros((), jnp.int32), jnp.zeros((), plan.dtype)
+    still = vec3(jnp.zeros(3, plan.dtype))
+    path = new_path(Ray(still, still._replace(z=real - 1.0)), None, zero + plan.background, plan)
+    lane = Lane(
+        zero + sink,
+        zero,
+        zero,
+        jnp.zeros((), jnp.uint32),
+        zero,
+        zero,
+        zero if plan.wavelengths_per_sample > 1 else None,
+        path,
+    )
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (lanes, *leaf.shape)), lane)
+
+
+def _advance(lane: Lane, plan: Plan, view: View, samples: FilmSamples, hits: Array) -> Lane:
+    """The lane's path advanced by one surface; where it has ended, that of its next sample."""
+    lane = once(lambda: _next_sample(lane, plan, view, samples, hits), view.one)
+    numbers, pixel = _numbers(plan, view), _pixel_number(view, lane.x, lane.y)
+    word, waves = samples.number[lane.sample], plan.wavelengths_per_sample
+    wave, weights = lane.wave, None
+    if samples.weights is not None:
+        # A sample whose path meets glass at once is followed at all its wavelengths, any other at
+        # one that is drawn.
+        split = wave >= 0
+        drawn = numbers.of_film(pixel, word, 2) * waves
+        word = jnp.where(split, word * np.uint32(waves) + wave.astype(jnp.uint32), word)
+        wave = jnp.where(split, wave, drawn.astype(jnp.int32))
+        factor = jnp.where(split, 1.0, float(waves))
+        weights = tuple(channel[lane.sample, wave] * factor for channel in samples.weights)
+    setting = Setting(
+        view.tables,
+        plan,
+        lambda bounces, decision: numbers.of_bounce(pixel, word, bounces, decision),
+        lambda ball: samples.indices[lane.sample if waves > 1 else 0, wave, ball],
+        weights,
+        view.cutoff,
+        view.one,
+    )
+    return lane._replace(path=bounce(lane.path, setting))
+
+
+def _next_sample(lane: Lane, plan: Plan, view: View, samples: FilmSamples, hits: Array) -> Lane:
+    """The lane with the path of its next sample or wavelength, where the present one has ended."""
+    ended, lowest = ~lane.path.alive, lane.waiting & (~lane.waiting + np.uint32(1))
+    again = jnp.zeros_like(ended) if lane.waves_left is None else lane.waves_left > 0
+    starts = ended & (again | (lane.waiting != 0))
+    following = jax.lax.population_count(lowest - np.uint32(1)).astype(jnp.int32)
+    sample = jnp.where(again, lane.sample, jnp.minimum(following, plan.samples - 1))
+    ray = _sample_ray(plan, view, samples, lane.x, lane.y, sample)
+    surface = hits[lane.slot * plan.samples + sample]
+    path = new_path(ray, None, surface, plan)._replace(radiance=lane.path.radiance)
+    new = lane._replace(
+        waiting=jnp.where(again, lane.waiting, lane.waiting & ~lowest), sample=sample, path=path
+    )
+    if lane.waves_left is not None:
+        at_glass = surface < plan.balls
+        left = jnp.where(again, lane.waves_left, plan.wavelengths_per_sample) - 1
+        new = new._replace(
+            wave=jnp.where(at_glass, plan.wavelengths_per_sample - 1 - left, -1),
+            waves_left=jnp.where(at_glass, left, 0),
+        )
+    return choose(starts, new, lane)
