@@ -39,6 +39,8 @@ class Bench(NamedTuple):
             draw=lambda bounces, decision: jnp.asarray(chooses),
             index=lambda ball: indices[ball],
             weights=None,
+            always=None,
+            split=None,
             cutoff=jnp.zeros(()),
             one=None,
         )

@@ -284,7 +284,16 @@ def film_spectrum(film: Film, plan: Plan) -> Spectrum:
         k for k in range(round(samples * 0.618) or 1, samples + 1) if np.gcd(k, samples) == 1
     )
     taken = np.arange(samples) * step % samples + np.arange(count)[:, None] * samples
-    return Spectrum(wavelengths[taken], None, weights[taken])
+    if not plan.scattering:
+        return Spectrum(wavelengths[taken], None, weights[taken])
+    # Each sample is followed at a middle wavelength in all channels, and where that path meets
+    # dispersive glass, by the same numbers at wavelengths of its own: what these show otherwise
+    # than the middle one is the dispersion, and hardly anything else of it is noise.
+    middle = np.full((1, samples), wavelengths[wavelengths.size // 2])
+    rest = 1.0 / samples - weights[taken].sum(axis=0, keepdims=True)
+    return Spectrum(
+        np.concatenate([middle, wavelengths[taken]]), None, np.concatenate([rest, weights[taken]])
+    )
 
 
 def glass_indices(scene: Scene, wavelengths: Array) -> tuple[Array, ...]:

@@ -542,6 +542,23 @@ def glass_interface(
     return Interface(eta, cos_t, reflectance, differ)
 
 
+class Split(NamedTuple):
+    """How both ways are taken where a sample meets dispersive glass first.
+
+    The reflected path serves all channels, for it goes the same way at all wavelengths.
+
+    Args:
+        now: whether this is the sample's first surface, and glass.
+        reflects: whether this is the reflected path.
+        ratios: the index of each channel, its mean over what the channel sees, over that at the
+            path's wavelength.
+    """
+
+    now: Array
+    reflects: Array
+    ratios: Channels
+
+
 class Setting(NamedTuple):
     """What a bounce needs beside its path.
 
@@ -551,6 +568,8 @@ class Setting(NamedTuple):
         draw: from the number of the bounce, and which of its decisions, to a number in [0, 1).
         index: index of a ball's glass at the path's wavelength.
         weights: what the path counts once it has met dispersive glass; None where nothing does.
+        always: whether the path counts before, too; None where nothing has weights.
+        split: how paths part at the first surface; None where they never do.
         cutoff: part of its light with which a path ends.
         one: as in `once`.
     """
@@ -560,6 +579,8 @@ class Setting(NamedTuple):
     draw: Callable[[Array, int], Real]
     index: Index
     weights: Channels | None
+    always: Array | None
+    split: Split | None
     cutoff: Real
     one: Array | None
 
@@ -640,12 +661,13 @@ def _go_on(
 ) -> Path:
     """The moved path if it goes on; else the old one, ended, with finite numbers."""
     bounces = path.bounces + jnp.where(differ, 1, 0)
-    brightest = reduce(jnp.maximum, moved.throughput)
+    # Colours have negative parts where a wavelength is outside what a screen can show.
+    brightest = reduce(jnp.maximum, map(jnp.abs, moved.throughput))
     # A path of b bounces has b + 1 segments, and the light that it adds next came over one more.
     alive = path.alive & goes_on & (brightest > setting.cutoff)
     alive = alive & (bounces < setting.plan.depth - 1)
     kept = choose(alive, moved._replace(bounces=bounces), path)
-    return kept._replace(radiance=radiance, alive=alive)
+    return kept._replace(radiance=radiance, alive=alive, spectral=moved.spectral)
 
 
 def _distance_to_ball(
@@ -700,14 +722,17 @@ def _one_way(path: Path, setting: Setting) -> Path:
         throughput=scattered.throughput,
         spectral=scattered.spectral,
     )
-    radiance = path.radiance
+    radiance, counts = path.radiance, path.alive
+    if setting.always is not None:
+        assert scattered.spectral is not None
+        counts = counts & (setting.always | scattered.spectral)
     if plan.lit:
-        shown = once(lambda: _lamplight(path, scattered, setting), setting.one)
+        shown = once(lambda: _lamplight(path, counts, scattered, setting), setting.one)
         radiance = tuple(r + x for r, x in zip(radiance, shown, strict=True))
     spheres = all_spheres(tables.world, plan, setting.one)
     surface = nearest(moved.ray, tables.world, plan, path.surface, spheres)
     light = emitted(surface, moved, tables, plan)
-    arrives = path.alive & scattered.goes_on & (surface >= plan.first_lamp)
+    arrives = counts & scattered.goes_on & (surface >= plan.first_lamp)
     factor = jnp.where(arrives, 1.0, 0.0)
     if plan.lit:
         factor = factor * _chance_weight(surface, scattered, tables, plan)
@@ -739,9 +764,9 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
         lambda: surface_indices(point, outward, ball, setting.index, world, plan), setting.one
     )
 
-    def ways() -> tuple[Mix, Vec3 | None, Array]:
-        """How the new direction is mixed, of what, and whether there is a surface at all."""
-        unit, zero = None, jnp.zeros_like(cosine)
+    def ways() -> tuple[Mix, Vec3 | None, Array, Channels | None]:
+        """How the new direction is mixed, of what, whether there is a surface, what goes there."""
+        unit, shares, zero = None, None, jnp.zeros_like(cosine)
         mix, differ = Mix(zero + 1.0, 2.0 * cos_i, zero), jnp.ones(cosine.shape, bool)
         if plan.numbers_per_bounce > 1:
             unit = uniform_direction(draw(0), draw(1))
@@ -756,12 +781,14 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
         if plan.balls:
             glass = glass_interface(media, cos_i, leaves)
             mirrored = draw(0) < jax.lax.stop_gradient(glass.reflectance)
+            if setting.split is not None:
+                mirrored, shares = _parted(mirrored, glass, cos_i, leaves, setting.split)
             bent = Mix(1.0 / glass.eta, cos_i / glass.eta - glass.cos_t, zero)
             through = choose(mirrored, Mix(zero + 1.0, 2.0 * cos_i, zero), bent)
             mix, differ = choose(is_glass, through, mix), glass.differ | ~is_glass
-        return mix, unit, differ
+        return mix, unit, differ, shares
 
-    mix, unit, differ = once(ways, setting.one)
+    mix, unit, differ, shares = once(ways, setting.one)
 
     def mixed() -> Vec3:
         """The new direction, of any length."""
@@ -784,10 +811,15 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
         throughput = tuple(
             t * jnp.where(is_glass, 1.0, a) for t, a in zip(path.throughput, albedo, strict=True)
         )
+        if shares is not None:
+            throughput = tuple(t * share for t, share in zip(throughput, shares, strict=True))
         spectral = path.spectral
         if spectral is not None:
-            now = is_glass & ~spectral
-            spectral = spectral | is_glass
+            disperses = is_glass
+            if setting.split is not None:
+                disperses = is_glass & ~(setting.split.now & setting.split.reflects)
+            now = disperses & ~spectral
+            spectral = spectral | disperses
             if setting.weights is not None:
                 throughput = tuple(
                     t * jnp.where(now, w, 1.0)
@@ -800,6 +832,20 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
         return _aim(scattered, facing, draw, setting) if plan.lit else scattered
 
     return once(finished, setting.one)
+
+
+def _parted(
+    mirrored: Array, glass: Interface, cos_i: Real, leaves: Array, split: Split
+) -> tuple[Array, Channels]:
+    """Whether a path is reflected, and its share of the light, where the ways may part."""
+    shares = []
+    for ratio in split.ratios:
+        eta = glass.eta * choose(leaves, 1.0 / ratio, ratio)
+        reflectance = fresnel_reflectance(cos_i, cos_transmitted(cos_i, eta), eta)
+        reflectance = jnp.where(glass.differ, reflectance, 0.0)
+        share = jnp.where(split.reflects, reflectance, 1.0 - glass.reflectance)
+        shares.append(jnp.where(split.now, share, 1.0))
+    return jnp.where(split.now, split.reflects, mirrored), tuple(shares)
 
 
 class Mix(NamedTuple):
@@ -936,7 +982,7 @@ def _turn_to(axis: Vec3, vector: Vec3) -> Vec3:
     return axis * vector.x + first * vector.y + second * vector.z
 
 
-def _lamplight(path: Path, scattered: Scattered, setting: Setting) -> Channels:
+def _lamplight(path: Path, counts: Array, scattered: Scattered, setting: Setting) -> Channels:
     """Radiance that comes straight from the lamp that was aimed at."""
     tables, plan = setting.tables, setting.plan
     assert scattered.to_lamp is not None
@@ -946,7 +992,7 @@ def _lamplight(path: Path, scattered: Scattered, setting: Setting) -> Channels:
     surface = nearest(scattered.to_lamp, tables.world, plan, path.surface, spheres)
     assert scattered.lamp is not None
     light = emitted(scattered.lamp, to_lamp, tables, plan)
-    factor = jnp.where(path.alive & (surface == scattered.lamp), scattered.lamp_share, 0.0)
+    factor = jnp.where(counts & (surface == scattered.lamp), scattered.lamp_share, 0.0)
     return tuple(t * factor * x for t, x in zip(scattered.throughput, light, strict=True))
 
 
@@ -1100,7 +1146,7 @@ def _radiance(plan: Plan, indices: tuple[Array, ...], lanes: Lanes, loop: Loop) 
         return jnp.mean(radiance, axis=1, keepdims=True)
     alike = 1.0 / (lanes.weights.shape[0] * lanes.weights.shape[1])
     if plan.scattering:  # a path has been weighted where it met glass, if it did
-        return radiance * alike
+        return radiance * (1.0 / lanes.weights.shape[1])
     weights = jnp.where(met[None, :, :, None], lanes.weights[:, :, None, :], alike)
     return radiance * weights
 
@@ -1116,8 +1162,7 @@ def _to_the_end(
     by_sample = 0 if index is not None and index.ndim == 3 else None
     weights = None
     if lanes.weights is not None:
-        count = lanes.weights.shape[0] * lanes.weights.shape[1]
-        weights = tuple(jnp.moveaxis(lanes.weights * count, -1, 0))
+        weights = tuple(jnp.moveaxis(lanes.weights * lanes.weights.shape[1], -1, 0))
 
     def advance(
         path: Path,
@@ -1129,15 +1174,14 @@ def _to_the_end(
         paint: Paint,
         inside: bool | None,
     ) -> Path:
-        # Paths of one sample at several wavelengths share their numbers only if summed branches
-        # leave them few to draw.
-        word = sample * np.uint32(copies) + wave if plan.scattering else sample
         setting = Setting(
             Tables(lanes.world, paint),
             plan,
-            partial(numbers.of_bounce, pixel, word),
+            partial(numbers.of_bounce, pixel, sample),
             lambda ball: _pick(index, ball),  # type: ignore[arg-type]
-            weights,
+            weights if plan.scattering else None,
+            None if weights is None else wave == 0,
+            None,
             lanes.cutoff,
             lanes.one,
         )

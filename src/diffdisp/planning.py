@@ -16,8 +16,8 @@ from diffdisp.texture import Checker, Checker2D, Texture
 WAVELENGTHS_PER_SAMPLE = 8
 """Wavelengths that one film sample carries through glass in a colour picture."""
 
-SCATTERED_WAVELENGTHS = 4
-"""The same where paths go on from matte or metal surfaces: each wavelength is a path of its own."""
+SCATTERED_WAVELENGTHS = 2
+"""The same where paths go on from matte or metal surfaces: beside that of a path for all."""
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,7 @@ from diffdisp.chunks import (
     run_numbers,
     workers,
 )
+from diffdisp.color import wavelength_strata
 from diffdisp.film import Film
 from diffdisp.integrator import Tables, world_tables
 from diffdisp.planning import Plan, make_plan
@@ -275,8 +276,9 @@ def _trace(
         half=tuple(channel[0] for channel in paint.half),
     )
     indices = glass_indices(scene, jnp.atleast_2d(spectrum.wavelengths))
-    weights = None
+    weights = ratios = None
     if spectrum.weights is not None:
+        ratios = _channel_ratios(scene, spectrum.wavelengths[0, 0])
         weights = tuple(jnp.moveaxis(spectrum.weights, (2, 1, 0), (0, 1, 2)) * plan.samples)
     samples = FilmSamples(
         run.number,
@@ -285,11 +287,20 @@ def _trace(
         run.cell,
         jnp.stack(indices, axis=-1).swapaxes(0, 1) if indices else jnp.zeros((1, 1, 0)),
         weights,
+        ratios,
     )
     width, height = (edge.astype(jnp.int32) for edge in size)
     tables = Tables(world_tables(scene), paint)
     view = View(tables, scene.camera, width, height, run.seed, run.cutoff, run.one)
     return trace_tiles(plan, edge, lanes, view, samples, tiles)
+
+
+def _channel_ratios(scene: Scene, middle: Real) -> tuple[jax.Array, ...]:
+    """For each channel, each ball's mean index over what the channel sees, over the middle one."""
+    wavelengths, weights = wavelength_strata(64)
+    seen = jnp.stack(glass_indices(scene, jnp.asarray(wavelengths, middle.dtype)))
+    one = jnp.stack(glass_indices(scene, middle[None]))
+    return tuple((seen @ jnp.asarray(weights, middle.dtype) / one).T)
 
 
 trace_jit = partial(jax.jit, static_argnums=(0, 1, 2), compiler_options=WIDE_VECTORS)(_trace)

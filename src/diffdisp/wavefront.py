@@ -20,6 +20,7 @@ from diffdisp.integrator import (
     Candidates,
     Path,
     Setting,
+    Split,
     Tables,
     bounce,
     emitted,
@@ -80,8 +81,10 @@ class FilmSamples(NamedTuple):
         down: from its upper edge to that of the cell, pixels.
         cell: width and height of a cell, pixels.
         indices: of each ball's glass, for each sample's wavelengths; of one where all have one.
-        weights: what the paths at each of a sample's wavelengths count, for each channel; over
-            all of them the mean of a pass's samples is about 1. None where none has a wavelength.
+        weights: what the paths at each of a sample's wavelengths count, for each channel, once
+            they have met dispersive glass; None where there is none.
+        ratios: index of each ball's glass in each channel over that at the first wavelength; None
+            where there are no weights.
     """
 
     number: UInt32[Array, " samples"]
@@ -90,6 +93,7 @@ class FilmSamples(NamedTuple):
     cell: tuple[Real, Real]
     indices: Float[Array, "samples wavelengths balls"]
     weights: tuple[Float[Array, "samples wavelengths"], ...] | None
+    ratios: tuple[Float[Array, " balls"], ...] | None
 
 
 class View(NamedTuple):
@@ -113,8 +117,10 @@ class Lane(NamedTuple):
         y: its row.
         waiting: a bit for each sample that is still to come.
         sample: the present one.
-        wave: the present one of the sample's wavelengths.
-        waves_left: how many of them are still to come; None where none has any.
+        wave: the present one of the sample's wavelengths; None where none has any. The first is
+            the middle one, the others follow if its path has met dispersive glass.
+        way: what the sample meets first: glass, through which its path goes; glass that reflects
+            it; or nothing of glass. None as before.
         path: the present path; its radiance is that of all the pixel's paths.
     """
 
@@ -123,9 +129,13 @@ class Lane(NamedTuple):
     y: Int[Array, ""]
     waiting: UInt32[Array, ""]
     sample: Int[Array, ""]
-    wave: Int[Array, ""]
-    waves_left: Int[Array, ""] | None
+    wave: Int[Array, ""] | None
+    way: Int[Array, ""] | None
     path: Path
+
+
+NO_GLASS, THROUGH, REFLECTED = 0, 1, 2
+"""The ways of a lane. Through glass a sample goes at each wavelength but the first."""
 
 
 def tile_edge(samples: int) -> int:
@@ -221,7 +231,7 @@ def trace_tiles(
     """
     shown, waiting, hits = _first_hits(plan, edge, view, samples, tiles)
     pixels = waiting.shape[0]
-    place = jnp.cumsum((waiting != 0).astype(jnp.int32)) - 1
+    place = jnp.cumsum(waiting != 0, dtype=jnp.int32) - 1
     queue = jnp.zeros(pixels + 1, jnp.int32)
     queue = queue.at[jnp.where(waiting != 0, place, pixels)].set(np.arange(pixels, dtype=np.int32))
     collected = _follow(
@@ -269,7 +279,7 @@ def _first_hits(
     # A sphere of no size for the rows that only fill the groups.
     centers = Vec3(*(jnp.append(axis, 0.0) for axis in world.centers))
     radii = jnp.append(world.radii, 0.0)
-    numbers = jnp.asarray(np.append(surface_numbers(plan)[0], 0))
+    numbers = jnp.asarray(np.append(surface_numbers(plan)[0], np.int32(0)))
 
     def see(tile: Array) -> tuple[tuple[Array, ...], Array, Array]:
         rows = tiles.candidates[tile]
@@ -292,7 +302,9 @@ def _first_hits(
 
         of_pixel = jax.vmap(one_sample, (None, None, 0))
         column, row = tiles.x[tile] + x, tiles.y[tile] + y
-        shown, surface = jax.vmap(of_pixel, (0, 0, None))(column, row, np.arange(plan.samples))
+        shown, surface = jax.vmap(of_pixel, (0, 0, None))(
+            column, row, np.arange(plan.samples, dtype=np.int32)
+        )
         inside = (column < view.width) & (row < view.height)
         bits = np.uint32(1) << np.arange(plan.samples, dtype=np.uint32)
         goes_on = (surface >= 0) & inside[:, None]
@@ -331,8 +343,7 @@ def _follow(
     advance = jax.vmap(lambda lane: _advance(lane, plan, view, samples, hits))
 
     def busy(lane: Lane) -> Array:
-        more = lane.path.alive | (lane.waiting != 0)
-        return more if lane.waves_left is None else more | (lane.waves_left > 0)
+        return lane.path.alive | (lane.waiting != 0) | _splits(lane, samples)
 
     def collect(lane: Lane, results: tuple[Array, ...]) -> tuple[Array, ...]:
         slot = jnp.where(busy(lane), pixels, lane.slot)
@@ -341,7 +352,7 @@ def _follow(
 
     def refill(lane: Lane, taken: Array) -> tuple[Lane, Array]:
         idle = ~busy(lane)
-        place = taken + jnp.cumsum(idle.astype(jnp.int32)) - 1
+        place = taken + jnp.cumsum(idle, dtype=jnp.int32) - 1
         fresh = idle & (place < length)
         slot = queue[jnp.where(fresh, place, pixels)]
         tile, pixel = slot // (edge * edge), slot % (edge * edge)
@@ -354,7 +365,7 @@ def _follow(
         )
         # What idles for good writes its result once more, to a place that nobody reads.
         rested = lane._replace(slot=jnp.where(idle, pixels, lane.slot))
-        taken = jnp.minimum(taken + jnp.sum(idle.astype(jnp.int32)), length)
+        taken = jnp.minimum(taken + jnp.sum(idle, dtype=jnp.int32), length)
         return choose(fresh, renewed, rested), taken
 
     def turn(state: tuple[Lane, tuple[Array, ...], Array]) -> tuple[Lane, tuple[Array, ...], Array]:
@@ -363,7 +374,7 @@ def _follow(
         lane, taken = refill(lane, taken)
         least = jnp.where(taken < length, int(lanes * (1 - IDLE)), 0)
         lane = jax.lax.while_loop(
-            lambda lane: jnp.sum(busy(lane).astype(jnp.int32)) > least, advance, lane
+            lambda lane: jnp.sum(busy(lane), dtype=jnp.int32) > least, advance, lane
         )
         return lane, results, taken
 
@@ -389,8 +400,8 @@ def _idle_lanes(plan: Plan, lanes: int, sink: int, view: View) -> Lane:
         zero,
         jnp.zeros((), jnp.uint32),
         zero,
-        zero,
-        zero if plan.wavelengths_per_sample > 1 else None,
+        None if path.spectral is None or plan.bands else zero,
+        None if path.spectral is None or plan.bands else zero,
         path,
     )
     return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (lanes, *leaf.shape)), lane)
@@ -400,34 +411,53 @@ def _advance(lane: Lane, plan: Plan, view: View, samples: FilmSamples, hits: Arr
     """The lane's path advanced by one surface; where it has ended, that of its next sample."""
     lane = once(lambda: _next_sample(lane, plan, view, samples, hits), view.one)
     numbers, pixel = _numbers(plan, view), _pixel_number(view, lane.x, lane.y)
-    word, waves = samples.number[lane.sample], plan.wavelengths_per_sample
-    wave, weights = lane.wave, None
+    word, wave, row = samples.number[lane.sample], 0, 0
+    weights = always = split = None
     if samples.weights is not None:
-        # A sample whose path meets glass at once is followed at all its wavelengths, any other at
-        # one that is drawn.
-        split = wave >= 0
-        drawn = numbers.of_film(pixel, word, 2) * waves
-        word = jnp.where(split, word * np.uint32(waves) + wave.astype(jnp.uint32), word)
-        wave = jnp.where(split, wave, drawn.astype(jnp.int32))
-        factor = jnp.where(split, 1.0, float(waves))
-        weights = tuple(channel[lane.sample, wave] * factor for channel in samples.weights)
+        assert lane.wave is not None
+        assert lane.way is not None
+        assert samples.ratios is not None
+        row, wave = lane.sample, lane.wave
+        weights = tuple(_look_up(channel, row, wave) for channel in samples.weights)
+        always = wave == 0
+        ball = jnp.minimum(lane.path.surface, plan.balls - 1)
+        split = Split(
+            (lane.way != NO_GLASS) & (lane.path.last < 0),
+            lane.way == REFLECTED,
+            tuple(_look_up(ratio, ball) for ratio in samples.ratios),
+        )
     setting = Setting(
         view.tables,
         plan,
         lambda bounces, decision: numbers.of_bounce(pixel, word, bounces, decision),
-        lambda ball: samples.indices[lane.sample if waves > 1 else 0, wave, ball],
+        lambda ball: _look_up(samples.indices, row, wave, ball),
         weights,
+        always,
+        split,
         view.cutoff,
         view.one,
     )
     return lane._replace(path=bounce(lane.path, setting))
 
 
+def _look_up(table: Array, *place: Array | int) -> Array:
+    return table.at[place].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+
+def _splits(lane: Lane, samples: FilmSamples) -> Array:
+    """Whether a path has ended that others of its sample have to follow."""
+    if lane.wave is None:
+        return jnp.zeros_like(lane.path.alive)
+    assert lane.path.spectral is not None
+    more = lane.path.spectral & (lane.wave + 1 < samples.indices.shape[1])
+    return ~lane.path.alive & (more | (lane.way == THROUGH))
+
+
 def _next_sample(lane: Lane, plan: Plan, view: View, samples: FilmSamples, hits: Array) -> Lane:
     """The lane with the path of its next sample or wavelength, where the present one has ended."""
-    ended, lowest = ~lane.path.alive, lane.waiting & (~lane.waiting + np.uint32(1))
-    again = jnp.zeros_like(ended) if lane.waves_left is None else lane.waves_left > 0
-    starts = ended & (again | (lane.waiting != 0))
+    lowest = lane.waiting & (~lane.waiting + np.uint32(1))
+    again = _splits(lane, samples)
+    starts = ~lane.path.alive & (again | (lane.waiting != 0))
     following = jax.lax.population_count(lowest - np.uint32(1)).astype(jnp.int32)
     sample = jnp.where(again, lane.sample, jnp.minimum(following, plan.samples - 1))
     ray = _sample_ray(plan, view, samples, lane.x, lane.y, sample)
@@ -436,11 +466,13 @@ def _next_sample(lane: Lane, plan: Plan, view: View, samples: FilmSamples, hits:
     new = lane._replace(
         waiting=jnp.where(again, lane.waiting, lane.waiting & ~lowest), sample=sample, path=path
     )
-    if lane.waves_left is not None:
+    if lane.wave is not None:
+        last = lane.wave + 1 == samples.indices.shape[1]
+        turns = again & last  # only what has gone through glass goes on after its last wavelength
         at_glass = surface < plan.balls
-        left = jnp.where(again, lane.waves_left, plan.wavelengths_per_sample) - 1
+        first, fresh_way = jnp.where(at_glass, 1, 0), jnp.where(at_glass, THROUGH, NO_GLASS)
         new = new._replace(
-            wave=jnp.where(at_glass, plan.wavelengths_per_sample - 1 - left, -1),
-            waves_left=jnp.where(at_glass, left, 0),
+            wave=jnp.where(again, jnp.where(last, 0, lane.wave + 1), first),
+            way=jnp.where(again, jnp.where(turns, REFLECTED, lane.way), fresh_way),
         )
     return choose(starts, new, lane)
