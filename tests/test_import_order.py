@@ -23,6 +23,7 @@ ORDER = (
     "sampling",
     "planning",
     "integrator",
+    "programs",
     "chunks",
     "wavefront",
     "rendering",

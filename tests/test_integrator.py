@@ -37,7 +37,7 @@ class Bench(NamedTuple):
             tables=Tables(world_tables(self.scene), paint_table(self.scene)),
             plan=self.plan,
             draw=lambda bounces, decision: jnp.asarray(chooses),
-            index=lambda ball: indices[ball],
+            index_of=lambda ball: indices[ball],
             weights=None,
             always=None,
             split=None,

@@ -413,7 +413,7 @@ def test_under_jit_a_render_is_the_same():
 
 
 def programs():
-    return rendering._render_chunks_jit._cache_size()
+    return rendering.render_chunks_jit._cache_size()
 
 
 def test_other_numbers_are_no_other_program():

@@ -256,7 +256,7 @@ def _render(options: argparse.Namespace) -> int:
         raise ValueError("render needs -o OUT; only --plan goes without a picture")
     from diffdisp.image import Picture, check_output, write_picture
     from diffdisp.planning import make_plan
-    from diffdisp.rendering import compile_ahead, render
+    from diffdisp.rendering import compile_ahead, render, render_progressively
     from diffdisp.scene_file import load_scene
 
     scene = load_scene(options.scene)
@@ -272,14 +272,19 @@ def _render(options: argparse.Namespace) -> int:
         return DONE
     _keep_compiled()
     knobs = {"samples": samples, "depth": depth, "dtype": dtype}
-    draw = partial(render, scene, film, seed=options.seed, **knobs)
+
+    def write(radiance: Any, drawn: int) -> None:
+        picture = Picture(radiance, film.wavelengths, drawn, depth, options.seed)
+        write_picture(options.output, picture)
+
+    if not options.timing:
+        draw = partial(render_progressively, scene, film, seed=options.seed, **knobs)
+        return _grow(draw, write, samples, options.output)
     build = partial(compile_ahead, scene, film, **knobs)
-    paths = film.width * film.height * samples
-    radiance, timing = _timed(build, draw, paths) if options.timing else (_watched(draw), None)
-    picture = Picture(radiance, film.wavelengths, samples, depth, options.seed)
-    write_picture(options.output, picture)
-    if timing:
-        print(json.dumps(timing))
+    draw_whole = partial(render, scene, film, seed=options.seed, **knobs)
+    radiance, timing = _timed(build, draw_whole, film.width * film.height * samples)
+    write(radiance, samples)
+    print(json.dumps(timing))
     return DONE
 
 
@@ -301,10 +306,29 @@ def _check_glasses(scene: Any, bands: tuple[float, float, int] | None) -> None:
     warnings.filterwarnings("ignore", ".* reach beyond the range")
 
 
-def _watched(draw: Callable[..., Any]) -> Any:
-    """The picture, with a progress bar."""
-    with _progress_bar("rendering", "chunk") as bar:
-        return draw(progress=lambda done, total: _advance(bar, done, total))
+def _grow(
+    draw: Callable[..., Iterator[Any]],
+    write: Callable[[Any, int], None],
+    samples: int,
+    output: str,
+) -> int:
+    """Draw and write a picture, with a progress bar; on Ctrl-C what there is of it by then."""
+    picture = None
+    try:
+        with _progress_bar("rendering", "part") as bar:
+            bar.set_postfix_str(f"0 of {samples} samples", refresh=False)
+            for picture in draw(progress=lambda done, total: _advance(bar, done, total)):
+                bar.set_postfix_str(f"{picture.samples} of {samples} samples")
+        assert picture is not None
+        write(*picture)
+    except KeyboardInterrupt:
+        if picture is None:
+            raise
+        # Once more where the first was cut short. A second Ctrl-C leaves the old file whole.
+        write(*picture)
+        holds = f"{output} holds {picture.samples} of {samples} samples"
+        return _complain(f"interrupted: {holds}", INTERRUPTED)
+    return DONE
 
 
 def _timed(

@@ -18,6 +18,7 @@ from diffdisp.dispersion import domain_error
 from diffdisp.film import Film
 from diffdisp.integrator import Lanes, Paint, lane_radiance, paint_table, world_tables
 from diffdisp.planning import Plan
+from diffdisp.programs import WIDE_VECTORS
 from diffdisp.sampling import Numbers, sample_grid
 from diffdisp.scene import Scene, is_glass, object_glass
 from diffdisp.vector import Array, Real
@@ -324,7 +325,7 @@ def chunk_lanes(
 
     def place(edges: Array, axis: int) -> Array:
         """From the left or upper edge of each pixel to its samples (S, P), pixels."""
-        within: Real | float = 0.5
+        within: Array | float = 0.5
         if plan.scattering:  # what is not averaged over the cell is seen at a point of it
             numbers = Numbers(plan.numbers_per_bounce, run.seed, plan.dtype)
             by_pixel = jax.vmap(numbers.of_film, (0, None, None))
@@ -359,7 +360,7 @@ def film_paint(plan: Plan, scene: Scene, spectrum: Spectrum) -> Paint:
     waves = spectrum.wavelengths.shape[0]
 
     def seen(channels: tuple[Array, ...]) -> tuple[Array, ...]:
-        table = jnp.stack(channels)
+        table: Array = jnp.stack(channels)
         if basis is not None and (plan.dispersive or plan.scattering):
             table = basis @ table
         if plan.channels == 1:
@@ -409,6 +410,16 @@ def each_chunk(chunk: Callable[[Pixels], Array], chunks: Pixels) -> jax.Array:
     )
 
 
+def plain(tree: Any, dtype: str) -> Any:
+    """The tree as NumPy's arrays, its real numbers in `dtype`: as a compiled program takes them."""
+
+    def cast(leaf: jax.Array | np.ndarray) -> np.ndarray:
+        array = np.asarray(leaf)
+        return array.astype(dtype) if np.issubdtype(array.dtype, np.floating) else array
+
+    return jax.tree.map(cast, tree)
+
+
 def in_dtype(tree: Any, dtype: str) -> Any:
     """The tree with its real numbers in `dtype`; whole numbers stay as they are."""
 
@@ -418,8 +429,5 @@ def in_dtype(tree: Any, dtype: str) -> Any:
 
     return jax.tree.map(cast, tree)
 
-
-WIDE_VECTORS = {"xla_cpu_prefer_vector_width": "512"}
-"""Compiler option for our own programs: a third less time where the processor has AVX-512."""
 
 render_chunks_jit = jax.jit(render_chunks, static_argnums=0, compiler_options=WIDE_VECTORS)

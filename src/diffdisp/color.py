@@ -1,12 +1,11 @@
 """Spectra as seen by a colour film: CIE 1931, linear sRGB, encoded sRGB.
 
-All constants are NumPy: colour-science is imported once, lazily, only to make them.
+All constants are NumPy's. Those that are published tables come from colour-science, by way of
+`tables.npz`, which `fixtures/make_tables.py` writes: importing the package itself costs 0.75 s.
 """
 
 import functools
-import importlib
-import warnings
-from typing import Any
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -44,12 +43,9 @@ def channel_responses() -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3
 
 @functools.cache
 def _channel_responses() -> tuple[np.ndarray, np.ndarray]:
-    colour = _colour_science()
-    observer = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
-    matrix = colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB
-    wavelength_nm = np.array(observer.wavelengths, np.float64)
-    response = np.array(observer.values, np.float64) @ np.array(matrix, np.float64).T
-    return _frozen(wavelength_nm), _frozen(response / response.sum(axis=0))
+    tables = _tables()
+    response = tables["observer"] @ tables["xyz_to_srgb"].T
+    return _frozen(tables["observer_nm"]), _frozen(response / response.sum(axis=0))
 
 
 def albedo_basis(
@@ -78,12 +74,10 @@ def albedo_basis(
 @functools.cache
 def _albedo_table() -> tuple[np.ndarray, np.ndarray]:
     """The published basis (every 5 nm), made exact under `channel_responses`."""
-    published = _colour_science().recovery.MSDS_BASIS_FUNCTIONS_sRGB_MALLETT2019
-    table_nm = np.array(published.wavelengths, np.float64)
+    table_nm, basis = _tables()["basis_nm"], _tables()["basis"]
     # The published sums are 1 to 1e-5. Made exact first, each row of the matrix below sums to 1,
     # so each row of its inverse does, and the product keeps both properties to rounding.
-    basis = np.array(published.values, np.float64)
-    basis /= basis.sum(axis=1, keepdims=True)
+    basis = basis / basis.sum(axis=1, keepdims=True)
     wavelength_nm, response = channel_responses()
     # Channel c of the light that basis function j reflects; the identity for D65 white.
     channels = response.T @ _interpolate(wavelength_nm, table_nm, basis)
@@ -246,15 +240,10 @@ def decode_srgb(encoded: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*sha
 
 
 @functools.cache
-def _colour_science() -> Any:
-    """The package `colour`, whose import costs 0.75 s."""
-    # Where matplotlib is missing, colour plants a mock of it in sys.modules, and everything that
-    # imports it later fails oddly: better a plain ImportError here.
-    importlib.import_module("matplotlib")
-    # It also switches NumPy's printing to that of version 1.13, for everybody: switched back.
-    with np.printoptions(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return importlib.import_module("colour")
+def _tables() -> dict[str, np.ndarray]:
+    """The published tables by name."""
+    with np.load(Path(__file__).with_name("tables.npz")) as file:
+        return {name: file[name] for name in file.files}
 
 
 def _interpolate(at: np.ndarray, table: np.ndarray, columns: np.ndarray) -> np.ndarray:

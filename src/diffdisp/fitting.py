@@ -20,7 +20,6 @@ from jaxtyping import Float
 
 from diffdisp.chunks import (
     COLOR_RANGE,
-    WIDE_VECTORS,
     Pixels,
     RunNumbers,
     Spectrum,
@@ -45,6 +44,7 @@ from diffdisp.glasses import glass_table
 from diffdisp.image import Picture
 from diffdisp.integrator import lane_radiance
 from diffdisp.planning import Plan, make_plan
+from diffdisp.programs import WIDE_VECTORS
 from diffdisp.scene import Scene, is_glass, object_glass, with_glass, without_names
 from diffdisp.vector import Array, Real
 

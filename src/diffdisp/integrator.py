@@ -136,10 +136,9 @@ def _even_odd_scale(material: Material, zero: Real) -> tuple[Array, Array, Real,
     if isinstance(texture, Solid):
         color = jnp.asarray(texture.color) * factor
         return color, color, zero, False
-    cubes = isinstance(texture, Checker)
-    scale = texture.scale / np.pi if cubes else 1.0 / texture.tile
+    scale = texture.scale / np.pi if isinstance(texture, Checker) else 1.0 / texture.tile
     even, odd = (jnp.asarray(c) * factor for c in (texture.even, texture.odd))
-    return even, odd, jnp.asarray(scale), cubes
+    return even, odd, jnp.asarray(scale), isinstance(texture, Checker)
 
 
 def _row(values: list[Real]) -> Float[Array, " rows"]:
@@ -150,14 +149,20 @@ def _table(vectors: list[Vec3]) -> Vec3:
     return Vec3(*(_row([v[axis] for v in vectors]) for axis in range(3)))
 
 
-def _pick(table: Array, index: Array) -> Array:
+def _pick(table: Array, index: Array | int) -> Array:
     """A row of a table that has it; of a table of one row, that row, without a look-up."""
     if table.shape[0] == 1:
         return table[0]
-    return table.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
+    return look_up(table, index)
 
 
-def _pick_vector(table: Vec3, index: Array) -> Vec3:
+def look_up(table: Array, *place: Array | int) -> Array:
+    """An element of a table that has it: no place is negative or past the end."""
+    rows = jnp.asarray(table).at[place]
+    return rows.get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+
+def _pick_vector(table: Vec3, index: Array | int) -> Vec3:
     return Vec3(*(_pick(component, index) for component in table))
 
 
@@ -237,7 +242,8 @@ def nearest(ray: Ray, world: World, plan: Plan, last: Array, spheres: Candidates
         return jnp.where(closer, found, best[0]), jnp.where(closer, group, best[1])
 
     none = jax.lax.bitcast_convert_type(jnp.full_like(ray.origin.x, jnp.inf), word)
-    best, group = none, jnp.zeros_like(last)
+    best: Array = none
+    group: Array = jnp.zeros_like(last)
     if isinstance(spheres.groups, int) and spheres.groups == 1:
         best = of_group(0)
     elif spheres.group:
@@ -313,11 +319,12 @@ def painted(
     tiled, cubed = (kinds[emits] for kinds in (plan.tiled, plan.cubed))
     if not (tiled or cubed):
         return tuple(_pick(channel, row) for channel in mean)
-    scale, waves = _pick(paint.scale[rows], row), []
+    scale = _pick(paint.scale[rows], row)
+    waves: list[Callable[[Ray], tuple[tuple[Real, ...], None]]] = []
     if tiled:
         plane = _plane_row(surface, plan)
 
-        def on_tiles(ray: Ray) -> tuple[tuple[Real, Real], None]:
+        def on_tiles(ray: Ray) -> tuple[tuple[Real, ...], None]:
             offset = point(ray) - _pick_vector(tables.world.points, plane)
             u, v = (_pick_vector(axis, plane) for axis in tables.world.axes)
             return (offset.dot(u) * scale, offset.dot(v) * scale), None
@@ -343,8 +350,8 @@ def _one_of(found: list[Array], second: Array | None) -> Array:
 
 def _is_odd(coordinates: tuple[Real, ...]) -> Array:
     """Whether a point is in an odd tile or cube: by one parity of all floors."""
-    cells = sum(jnp.floor(value) for value in coordinates)
-    return cells != 2.0 * jnp.floor(0.5 * cells)
+    cells = reduce(jnp.add, map(jnp.floor, coordinates))
+    return jnp.asarray(cells != 2.0 * jnp.floor(0.5 * cells))
 
 
 def _filtered(coordinates: Callable[[Ray], tuple[Any, None]], path: Path) -> Real:
@@ -566,7 +573,7 @@ class Setting(NamedTuple):
         tables: the scene.
         plan: its static choices.
         draw: from the number of the bounce, and which of its decisions, to a number in [0, 1).
-        index: index of a ball's glass at the path's wavelength.
+        index_of: index of a ball's glass at the path's wavelength.
         weights: what the path counts once it has met dispersive glass; None where nothing does.
         always: whether the path counts before, too; None where nothing has weights.
         split: how paths part at the first surface; None where they never do.
@@ -577,7 +584,7 @@ class Setting(NamedTuple):
     tables: Tables
     plan: Plan
     draw: Callable[[Array, int], Real]
-    index: Index
+    index_of: Index
     weights: Channels | None
     always: Array | None
     split: Split | None
@@ -611,7 +618,7 @@ def _both_ways(path: Path, setting: Setting, inside: Array | bool) -> Path:
         leaves = ray.direction.dot(outward) > 0 if plan.nested else inside
         facing = choose(leaves, -outward, outward)
         cos_i = jnp.abs(ray.direction.dot(outward))
-        media = surface_indices(point, outward, ball, setting.index, world, plan)
+        media = surface_indices(point, outward, ball, setting.index_of, world, plan)
         glass = glass_interface(media, cos_i, leaves)
         mirrored = reflect(ray.direction, facing, cos_i)
         bent = refract(ray.direction, facing, cos_i, glass.cos_t, glass.eta)
@@ -760,9 +767,12 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
     facing = choose(leaves, -outward, outward)
 
     ball = jnp.minimum(surface, plan.balls - 1)
-    media = plan.balls and once(
-        lambda: surface_indices(point, outward, ball, setting.index, world, plan), setting.one
-    )
+    media = None
+    if plan.balls:
+        media = once(
+            lambda: surface_indices(point, outward, ball, setting.index_of, world, plan),
+            setting.one,
+        )
 
     def ways() -> tuple[Mix, Vec3 | None, Array, Channels | None]:
         """How the new direction is mixed, of what, whether there is a surface, what goes there."""
@@ -778,14 +788,15 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
             mix = mix._replace(unit=radius * fuzz)
         if after_matte > first_matte:
             mix = choose(is_matte, Mix(zero, zero + 1.0, zero + 1.0), mix)
-        if plan.balls:
+        if media is not None:
             glass = glass_interface(media, cos_i, leaves)
-            mirrored = draw(0) < jax.lax.stop_gradient(glass.reflectance)
+            mirrored: Array = draw(0) < jax.lax.stop_gradient(glass.reflectance)
             if setting.split is not None:
                 mirrored, shares = _parted(mirrored, glass, cos_i, leaves, setting.split)
             bent = Mix(1.0 / glass.eta, cos_i / glass.eta - glass.cos_t, zero)
             through = choose(mirrored, Mix(zero + 1.0, 2.0 * cos_i, zero), bent)
-            mix, differ = choose(is_glass, through, mix), glass.differ | ~is_glass
+            mix = choose(is_glass, through, mix)
+            differ = jnp.asarray(glass.differ | ~is_glass)
         return mix, unit, differ, shares
 
     mix, unit, differ, shares = once(ways, setting.one)

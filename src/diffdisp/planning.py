@@ -157,8 +157,8 @@ class Plan:
             "glass": self.balls,
             "matte": last - first,
             "metal": self.metals,
-            "lamps": self.lamps,
-            "planes that shine": self.screens,
+            "lamp" if self.lamps == 1 else "lamps": self.lamps,
+            "shining plane" if self.screens == 1 else "shining planes": self.screens,
         }
         shown = [name for name, there in (("2-D", self.tiled), ("3-D", self.cubed)) if any(there)]
         # Where branches are chosen the samples are points; else they stand for their footprint.

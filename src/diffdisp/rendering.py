@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -11,7 +10,6 @@ import numpy as np
 from jaxtyping import Float
 
 from diffdisp.chunks import (
-    WIDE_VECTORS,
     RunNumbers,
     Spectrum,
     all_pixels,
@@ -26,6 +24,7 @@ from diffdisp.chunks import (
     in_threads,
     over_chunks,
     parts_of,
+    plain,
     render_chunks,
     render_chunks_jit,
     run_numbers,
@@ -35,6 +34,7 @@ from diffdisp.color import wavelength_strata
 from diffdisp.film import Film
 from diffdisp.integrator import Tables, world_tables
 from diffdisp.planning import Plan, make_plan
+from diffdisp.programs import Program, program
 from diffdisp.scene import Scene, without_names
 from diffdisp.vector import Real
 from diffdisp.wavefront import (
@@ -220,36 +220,51 @@ def _wavefront_pass(
     work: _Work, film: Film, spectrum: Spectrum, run: RunNumbers, progress: Progress
 ) -> Float[np.ndarray, "height width channels"]:
     """One pass by the wavefront loop."""
-    plan, tiles = work.plan, work.tiles
-    assert tiles is not None
-    edge, size = tile_edge(plan.samples), film_size(film)
-    bands = [spectrum]
-    if plan.dispersive and spectrum.basis is not None:
-        pairs = zip(np.asarray(spectrum.wavelengths), np.asarray(spectrum.basis), strict=True)
-        bands = [Spectrum(wavelength[None], basis[None], None) for wavelength, basis in pairs]
+    plan, edge = work.plan, tile_edge(work.plan.samples)
     rows, columns = -(-film.height // edge), -(-film.width // edge)
-    background = _background(work.scene, spectrum)
     picture = np.empty((rows, edge, columns, edge, film.channels), plan.dtype)
-    picture[...] = background
-    jobs = [(band, part) for band in range(len(bands)) for part in range(len(tiles))]
+    picture[...] = _background(work.scene, spectrum)
+    calls = _calls(work, film, spectrum, run)
 
-    def one(job: tuple[int, int]) -> None:
-        band, part = job[0], tiles[job[1]]
-        values = trace_jit(plan, edge, LANES, work.scene, bands[band], size, run, part)
-        shown = np.asarray(values)[: part.count]
-        channels = slice(band, band + 1) if len(bands) > 1 else slice(None)
-        across, down = part.x[: part.count] // edge, part.y[: part.count] // edge
-        picture[down, :, across, :, channels] = shown.reshape(-1, edge, edge, shown.shape[-1])
+    def one(call: _Call) -> None:
+        part = call.arguments[-1]
+        shown = np.asarray(trace(*call.arguments))[: part.filled]
+        across, down = part.x[: part.filled] // edge, part.y[: part.filled] // edge
+        picture[down, :, across, :, call.channels] = shown.reshape(-1, edge, edge, shown.shape[-1])
 
-    if jobs:
-        key = (plan, edge)
-        in_threads(one, jobs, plan.dtype, progress, alone=0 if key in _COMPILED else 1)
-        _COMPILED.add(key)
+    if calls:
+        trace = _trace_program(plan, calls[0].arguments)
+        in_threads(one, calls, plan.dtype, progress, alone=0)
     whole = picture.reshape(rows * edge, columns * edge, film.channels)
     return whole[: film.height, : film.width]
 
 
-_COMPILED: set[tuple[Plan, int]] = set()
+class _Call(NamedTuple):
+    """Arguments of the compiled program, and the film's channels that it fills."""
+
+    arguments: tuple[Any, ...]
+    channels: slice
+
+
+def _calls(work: _Work, film: Film, spectrum: Spectrum, run: RunNumbers) -> list[_Call]:
+    """The calls of the compiled program that make a pass."""
+    assert work.tiles is not None
+    bands, channels = [spectrum], [slice(None)]
+    if work.plan.dispersive and spectrum.basis is not None:
+        pairs = zip(np.asarray(spectrum.wavelengths), np.asarray(spectrum.basis), strict=True)
+        bands = [Spectrum(wavelength[None], basis[None], None) for wavelength, basis in pairs]
+        channels = [slice(band, band + 1) for band in range(len(bands))]
+    return [
+        _Call(plain((work.scene, band, film_size(film), run, part), work.plan.dtype), fills)
+        for band, fills in zip(bands, channels, strict=True)
+        for part in work.tiles
+    ]
+
+
+def _trace_program(plan: Plan, arguments: tuple[Any, ...]) -> Program:
+    """The compiled program of the wavefront loop."""
+    with jax.enable_x64(plan.dtype == "float64"):
+        return program(trace_picture, (plan, tile_edge(plan.samples), LANES), arguments)
 
 
 def _background(scene: Scene, spectrum: Spectrum) -> np.ndarray:
@@ -258,7 +273,7 @@ def _background(scene: Scene, spectrum: Spectrum) -> np.ndarray:
     return color if spectrum.basis is None else np.asarray(spectrum.basis) @ color
 
 
-def _trace(
+def trace_picture(
     plan: Plan,
     edge: int,
     lanes: int,
@@ -303,9 +318,6 @@ def _channel_ratios(scene: Scene, middle: Real) -> tuple[jax.Array, ...]:
     return tuple((seen @ jnp.asarray(weights, middle.dtype) / one).T)
 
 
-trace_jit = partial(jax.jit, static_argnums=(0, 1, 2), compiler_options=WIDE_VECTORS)(_trace)
-
-
 def compile_ahead(scene: Scene, film: Film, *, samples: int, depth: int, dtype: str) -> None:
     """Compile what `render` would run, without running it; for measuring how long that takes.
 
@@ -319,13 +331,11 @@ def compile_ahead(scene: Scene, film: Film, *, samples: int, depth: int, dtype: 
     work = _lay_out(scene, film, samples, depth, dtype)
     plan = work.plan
     spectrum = _of_pass(work.spectrum, work.cells[0], len(work.cells))
-    run, size = run_numbers(plan, 0, cells=work.cells), film_size(film)
-    with jax.enable_x64(dtype == "float64"):
-        if work.tiles is None:
-            chunks, _ = all_pixels(film, chunk_pixels(film, plan))
-            part = next(parts_of(chunks))
-            render_chunks_jit.lower(plan, work.scene, spectrum, size, part, run).compile()
-        elif work.tiles:
-            edge = tile_edge(plan.samples)
-            tiles = work.tiles[0]
-            trace_jit.lower(plan, edge, LANES, work.scene, spectrum, size, run, tiles).compile()
+    run = run_numbers(plan, 0, cells=work.cells)
+    if work.tiles is None:
+        chunks, _ = all_pixels(film, chunk_pixels(film, plan))
+        fixed = (plan, work.scene, spectrum, film_size(film))
+        with jax.enable_x64(dtype == "float64"):
+            render_chunks_jit.lower(*fixed, next(parts_of(chunks)), run).compile()
+    elif work.tiles:
+        _trace_program(plan, _calls(work, film, spectrum, run)[0].arguments)

@@ -24,6 +24,7 @@ from diffdisp.integrator import (
     Tables,
     bounce,
     emitted,
+    look_up,
     nearest,
     new_path,
     no_surface,
@@ -62,14 +63,14 @@ class Tiles(NamedTuple):
         candidates: rows of the table of spheres that a tile can see, filled up with one past its
             last row.
         groups: how many groups of four candidates count.
-        count: how many tiles there are; the others fill the table.
+        filled: how many tiles there are; the others fill the table.
     """
 
     x: Int[Array, " tiles"]
     y: Int[Array, " tiles"]
     candidates: Int[Array, "tiles rows"]
     groups: Int[Array, " tiles"]
-    count: Int[Array, ""]
+    filled: Int[Array, ""]
 
 
 class FilmSamples(NamedTuple):
@@ -154,8 +155,8 @@ def visible_tiles(scene: Scene, film: Film, plan: Plan, edge: int, workers: int)
         workers: how many parts are worked on at a time.
     """
     spheres = [obj.shape for obj in surfaces_of(scene) if isinstance(obj.shape, Sphere)]
-    x, y = np.meshgrid(np.arange(0, film.width, edge), np.arange(0, film.height, edge))
-    x, y = x.reshape(-1), y.reshape(-1)
+    columns, rows_down = np.arange(0, film.width, edge), np.arange(0, film.height, edge)
+    x, y = np.tile(columns, len(rows_down)), np.repeat(rows_down, len(columns))
     seen = _in_view(scene.camera, film, spheres, x, y, edge)
     some = np.flatnonzero(seen.any(axis=1) | (plan.planes > 0))
     counts = seen.sum(axis=1)
@@ -322,7 +323,7 @@ def _first_hits(
         jnp.zeros(capacity * size, jnp.uint32),
         jnp.zeros(capacity * size * plan.samples, jnp.int32),
     )
-    shown, waiting, hits = jax.lax.fori_loop(0, tiles.count, put, empty)
+    shown, waiting, hits = jax.lax.fori_loop(0, tiles.filled, put, empty)
     return list(shown), waiting, hits
 
 
@@ -348,7 +349,7 @@ def _follow(
     def collect(lane: Lane, results: tuple[Array, ...]) -> tuple[Array, ...]:
         slot = jnp.where(busy(lane), pixels, lane.slot)
         pairs = zip(results, lane.path.radiance, strict=True)
-        return tuple(whole.at[slot].set(value) for whole, value in pairs)
+        return tuple(jnp.asarray(whole).at[slot].set(value) for whole, value in pairs)
 
     def refill(lane: Lane, taken: Array) -> tuple[Lane, Array]:
         idle = ~busy(lane)
@@ -368,7 +369,7 @@ def _follow(
         taken = jnp.minimum(taken + jnp.sum(idle, dtype=jnp.int32), length)
         return choose(fresh, renewed, rested), taken
 
-    def turn(state: tuple[Lane, tuple[Array, ...], Array]) -> tuple[Lane, tuple[Array, ...], Array]:
+    def turn(state: Any) -> Any:
         lane, results, taken = state
         results = collect(lane, results)
         lane, taken = refill(lane, taken)
@@ -378,7 +379,7 @@ def _follow(
         )
         return lane, results, taken
 
-    def unfinished(state: tuple[Lane, tuple[Array, ...], Array]) -> Array:
+    def unfinished(state: Any) -> Array:
         return (state[2] < length) | jnp.any(busy(state[0]))
 
     results = tuple(jnp.zeros(pixels + 1, plan.dtype) for _ in range(plan.channels))
@@ -411,26 +412,28 @@ def _advance(lane: Lane, plan: Plan, view: View, samples: FilmSamples, hits: Arr
     """The lane's path advanced by one surface; where it has ended, that of its next sample."""
     lane = once(lambda: _next_sample(lane, plan, view, samples, hits), view.one)
     numbers, pixel = _numbers(plan, view), _pixel_number(view, lane.x, lane.y)
-    word, wave, row = samples.number[lane.sample], 0, 0
+    word = samples.number[lane.sample]
+    row: Array | int = 0
+    wave: Array | int = 0
     weights = always = split = None
     if samples.weights is not None:
         assert lane.wave is not None
         assert lane.way is not None
         assert samples.ratios is not None
         row, wave = lane.sample, lane.wave
-        weights = tuple(_look_up(channel, row, wave) for channel in samples.weights)
-        always = wave == 0
+        weights = tuple(look_up(channel, row, wave) for channel in samples.weights)
+        always = jnp.asarray(wave == 0)
         ball = jnp.minimum(lane.path.surface, plan.balls - 1)
         split = Split(
             (lane.way != NO_GLASS) & (lane.path.last < 0),
             lane.way == REFLECTED,
-            tuple(_look_up(ratio, ball) for ratio in samples.ratios),
+            tuple(look_up(ratio, ball) for ratio in samples.ratios),
         )
     setting = Setting(
         view.tables,
         plan,
         lambda bounces, decision: numbers.of_bounce(pixel, word, bounces, decision),
-        lambda ball: _look_up(samples.indices, row, wave, ball),
+        lambda ball: look_up(samples.indices, row, wave, ball),
         weights,
         always,
         split,
@@ -440,14 +443,11 @@ def _advance(lane: Lane, plan: Plan, view: View, samples: FilmSamples, hits: Arr
     return lane._replace(path=bounce(lane.path, setting))
 
 
-def _look_up(table: Array, *place: Array | int) -> Array:
-    return table.at[place].get(mode="promise_in_bounds", wrap_negative_indices=False)
-
-
 def _splits(lane: Lane, samples: FilmSamples) -> Array:
     """Whether a path has ended that others of its sample have to follow."""
     if lane.wave is None:
         return jnp.zeros_like(lane.path.alive)
+    assert lane.way is not None
     assert lane.path.spectral is not None
     more = lane.path.spectral & (lane.wave + 1 < samples.indices.shape[1])
     return ~lane.path.alive & (more | (lane.way == THROUGH))
@@ -467,6 +467,7 @@ def _next_sample(lane: Lane, plan: Plan, view: View, samples: FilmSamples, hits:
         waiting=jnp.where(again, lane.waiting, lane.waiting & ~lowest), sample=sample, path=path
     )
     if lane.wave is not None:
+        assert lane.way is not None
         last = lane.wave + 1 == samples.indices.shape[1]
         turns = again & last  # only what has gone through glass goes on after its last wavelength
         at_glass = surface < plan.balls
