@@ -8,7 +8,7 @@ from diffdisp.camera import Camera
 from diffdisp.dispersion import Sellmeier
 from diffdisp.film import Film
 from diffdisp.geometry import Plane, Sphere
-from diffdisp.material import Dielectric, Emitter
+from diffdisp.material import Dielectric, Emitter, Lambertian, Material, Metal
 from diffdisp.scene import Background, Object, Scene
 from diffdisp.texture import Checker2D
 from diffdisp.vector import Vec3
@@ -43,6 +43,23 @@ def ball(
 def lamp(center: Sequence[float], radius: float, color: Sequence[float] = WHITE) -> Object:
     """A shining sphere."""
     return Object(Sphere(center, radius), Emitter(color))
+
+
+def matte(albedo: float, center: Sequence[float] = ORIGIN, radius: float = 1.0) -> Object:
+    """A grey matte sphere."""
+    return Object(Sphere(center, radius), Lambertian([albedo] * 3))
+
+
+def metal(
+    share: float, center: Sequence[float] = ORIGIN, radius: float = 1.0, fuzz: float = 0.0
+) -> Object:
+    """A grey metal sphere."""
+    return Object(Sphere(center, radius), Metal([share] * 3, fuzz=fuzz))
+
+
+def ground(material: Material, y: float = -1.0) -> Object:
+    """A level plane."""
+    return Object(Plane([0.0, y, 0.0], [0.0, 1.0, 0.0]), material)
 
 
 def screen(z: float = -3.1, tile: float = 0.5, even: float = 0.1, odd: float = 1.0) -> Object:

@@ -1,6 +1,9 @@
+import contextlib
 import json
 import os
+import pty
 import re
+import signal
 import subprocess
 import sys
 import warnings
@@ -15,10 +18,14 @@ from fake_fit import fake_result
 from diffdisp import __main__ as command_line
 from diffdisp import fitting
 from diffdisp.__main__ import main
+from diffdisp.film import Film
 from diffdisp.image import Picture, read_picture, write_picture
+from diffdisp.rendering import Growing, render_progressively
+from diffdisp.scene_file import load_scene
 
 ROOT = Path(__file__).parents[1]
 FIXTURES = ROOT / "fixtures"
+GALLERY = FIXTURES / "scenes"
 
 CAMERA = """\
 [camera]
@@ -336,7 +343,7 @@ def test_memory_that_runs_out(scene, out, capsys, monkeypatch, error):
     def fail(*args, **options):
         raise error
 
-    monkeypatch.setattr("diffdisp.rendering.render", fail)
+    monkeypatch.setattr("diffdisp.rendering.render_progressively", fail)
     refused(capsys, ["render", scene, "-o", str(out / "a.png")], "not enough memory")
     assert list(out.iterdir()) == []
 
@@ -345,7 +352,7 @@ def test_a_fault_of_ours_is_not_bad_input(scene, out, monkeypatch):
     def fail(*args, **options):
         raise RuntimeError("a fault")
 
-    monkeypatch.setattr("diffdisp.rendering.render", fail)
+    monkeypatch.setattr("diffdisp.rendering.render_progressively", fail)
     with pytest.raises(RuntimeError, match="a fault"):
         main(["render", scene, "-o", str(out / "a.png")])
 
@@ -355,22 +362,132 @@ def test_a_missing_package_is_named(scene, out, capsys, monkeypatch):
     refused(capsys, ["render", scene, "-o", str(out / "a.exr")], "pip install 'diffdisp[io]'")
 
 
-def test_ctrl_c_leaves_the_old_file(scene, out, capsys, monkeypatch):
-    def interrupted(*args, progress, **options):
-        progress(1, 2)
-        raise KeyboardInterrupt
+# Ctrl-C.
 
-    monkeypatch.setattr("diffdisp.rendering.render", interrupted)
+SMALL = ["--size", "8x6", "--samples", "2", "--depth", "4"]
+THREE_PASSES = ["--size", "8x6", "--samples", "96", "--depth", "4"]
+"""A pass takes 32 samples, of so few pixels in one part."""
+
+
+@pytest.fixture
+def interrupt(monkeypatch):
+    """Let the renderer be interrupted when it tells that so many parts are done."""
+
+    def at_part(number):
+        def draw(*args, progress, **options):
+            def tell(done, total):
+                progress(done, total)
+                if done == number:
+                    raise KeyboardInterrupt
+
+            return render_progressively(*args, progress=tell, **options)
+
+        monkeypatch.setattr("diffdisp.rendering.render_progressively", draw)
+
+    return at_part
+
+
+def test_ctrl_c_before_the_first_pass_leaves_the_old_file(scene, out, capsys, interrupt):
+    interrupt(1)
     (out / "a.png").write_text("old")
-    assert main(["render", scene, "-o", str(out / "a.png")]) == 130
-    assert capsys.readouterr().err == "diffdisp: interrupted, nothing written\n"
+    assert main(["render", scene, "-o", str(out / "a.png"), *THREE_PASSES]) == 130
+    assert capsys.readouterr() == ("", "diffdisp: interrupted, nothing written\n")
     assert [file.name for file in out.iterdir()] == ["a.png"]
     assert (out / "a.png").read_text() == "old"
 
 
-# Good renders.
+@pytest.mark.parametrize("name", ["a.npz", "a.png", "a.tiff", "a.exr"])
+def test_ctrl_c_keeps_the_picture_so_far(scene, out, capsys, interrupt, name):
+    film = Film(8, 6)
+    passes = list(
+        render_progressively(load_scene(scene), film, samples=96, depth=4, dtype="float32")
+    )
+    interrupt(3)
+    (out / name).write_text("old")
+    assert main(["render", scene, "-o", str(out / name), *THREE_PASSES]) == 130
+    told = f"diffdisp: interrupted: {out / name} holds 64 of 96 samples\n"
+    assert capsys.readouterr() == ("", told)
+    assert [file.name for file in out.iterdir()] == [name]
+    picture = read_picture(out / name)
+    if name == "a.png":
+        write_picture(out / "b.png", Picture(passes[1].radiance))
+        np.testing.assert_array_equal(picture.radiance, read_picture(out / "b.png").radiance)
+        return
+    assert (picture.samples, picture.depth, picture.seed) == (64, 4, 0)
+    np.testing.assert_array_equal(picture.radiance, passes[1].radiance)
+    assert np.any(picture.radiance != passes[2].radiance)
 
-SMALL = ["--size", "8x6", "--samples", "2", "--depth", "4"]
+
+@pytest.mark.parametrize("times", [1, 2])
+def test_ctrl_c_while_writing(scene, out, capsys, monkeypatch, times):
+    """The first writes again; the second gives up, and the old file is whole."""
+    whole, interrupts = np.savez_compressed, []
+
+    def save(path, **fields):
+        whole(path, **fields)
+        if len(interrupts) < times:
+            path.write_bytes(path.read_bytes()[:100])
+            interrupts.append(path)
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(np, "savez_compressed", save)
+    (out / "a.npz").write_text("old")
+    assert main(["render", scene, "-o", str(out / "a.npz"), *SMALL]) == 130
+    assert len(interrupts) == times
+    assert [file.name for file in out.iterdir()] == ["a.npz"]
+    told = capsys.readouterr().err
+    if times == 1:
+        assert told == f"diffdisp: interrupted: {out / 'a.npz'} holds 2 of 2 samples\n"
+        assert read_picture(out / "a.npz").samples == 2
+    else:
+        assert told == "diffdisp: interrupted, nothing written\n"
+        assert (out / "a.npz").read_text() == "old"
+
+
+def test_ctrl_c_at_a_terminal(out):
+    """A process at work, a core in each of its threads, is told to stop."""
+    samples, path = 100_000, out / "a.npz"
+    command = [sys.executable, "-m", "diffdisp", "render", str(GALLERY / "default.toml")]
+    command += ["-o", str(path), "--size", "400x400", "--samples", str(samples)]
+    cache = {"JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir}
+    terminal, its_end = pty.openpty()
+    # A process whose parent ignores the signal ignores it too.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=its_end, env={**os.environ, **cache}
+        )
+    finally:
+        signal.signal(signal.SIGINT, before)
+        os.close(its_end)
+    told, stopped = "", False
+    try:
+        with contextlib.suppress(OSError):  # how Linux tells of the other end that it is closed
+            while heard := os.read(terminal, 4096):
+                told += heard.decode(errors="replace")
+                if not stopped and re.search(rf"\b[1-9][0-9]* of {samples} samples", told):
+                    process.send_signal(signal.SIGINT)
+                    stopped = True
+        printed, _ = process.communicate()
+    finally:
+        process.kill()
+        process.wait()
+        os.close(terminal)
+    assert stopped, told
+    assert process.returncode == 130
+    assert printed == b""
+    assert "Traceback" not in told
+    last = re.search(rf"diffdisp: interrupted: {path} holds (\d+) of {samples} samples\s*$", told)
+    assert last, told
+    picture = read_picture(path)
+    assert picture.radiance.shape == (400, 400, 3)
+    assert 0 < picture.samples < samples
+    assert picture.samples == int(last[1])
+    assert 0.1 < picture.radiance.mean() < 1
+    assert [file.name for file in out.iterdir()] == ["a.npz"]
+
+
+# Good renders.
 
 
 @pytest.mark.parametrize("name", ["a.npz", "a.png", "a.tiff", "a.exr"])
@@ -387,6 +504,19 @@ def test_render(scene, out, capsys, name, bands):
         assert (picture.samples, picture.depth, picture.seed) == (2, 4, 0)
         if bands:
             np.testing.assert_allclose(picture.wavelengths, [0.475, 0.625], rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["default", "dispersion", "lamps", "metal_and_matte"])
+def test_gallery(out, capsys, name):
+    scene, output = str(GALLERY / f"{name}.toml"), str(out / "a.npz")
+    assert main(["render", scene, "-o", output, "--size", "24x18", "--samples", "2"]) == 0
+    assert capsys.readouterr() == ("", "")
+    radiance = read_picture(output).radiance
+    assert radiance.shape == (18, 24, 3)
+    # Something is lit and something is not.
+    assert radiance.min() >= 0
+    assert 0.01 < radiance.mean() < 10
+    assert radiance.std() > 0.1 * radiance.mean()
 
 
 def test_float64_and_seed(scene, out):
@@ -422,11 +552,11 @@ def test_quality_and_defaults(scene, capsys, options, samples):
 def test_default_size(scene, out, monkeypatch):
     asked = {}
 
-    def render(scene, film, **options):
+    def draw(scene, film, **options):
         asked.update(options, size=(film.width, film.height), bands=film.wavelengths)
-        return np.zeros((film.height, film.width, 3), np.float32)
+        yield Growing(np.zeros((film.height, film.width, 3), np.float32), 16)
 
-    monkeypatch.setattr("diffdisp.rendering.render", render)
+    monkeypatch.setattr("diffdisp.rendering.render_progressively", draw)
     assert main(["render", scene, "-o", str(out / "a.png")]) == 0
     asked.pop("progress")
     assert asked == {
@@ -442,7 +572,7 @@ def test_default_size(scene, out, monkeypatch):
 
 def test_plan_with_output_also_renders(scene, out, capsys):
     assert main(["render", scene, "--plan", "-o", str(out / "a.png"), *SMALL]) == 0
-    assert "1 glass, 0 lamps, 1 planes" in capsys.readouterr().out
+    assert "1 glass, 1 shining plane\n" in capsys.readouterr().out
     assert [file.name for file in out.iterdir()] == ["a.png"]
 
 

@@ -1,13 +1,15 @@
 import jax
 import numpy as np
 import pytest
-from helpers import AIR, ball, bench, camera, furnace, lamp, screen
+from helpers import AIR, ball, bench, camera, furnace, ground, lamp, matte, metal, screen
 
 from diffdisp.film import Film
-from diffdisp.geometry import Plane
-from diffdisp.material import Emitter
+from diffdisp.geometry import Plane, Sphere
+from diffdisp.integrator import surfaces_of
+from diffdisp.material import Emitter, Lambertian, Metal
 from diffdisp.planning import make_plan
 from diffdisp.scene import Background, Object, Scene
+from diffdisp.texture import Checker, Checker2D
 
 BANDS, COLOR = Film(8, 8, wavelengths=[0.45, 0.55, 0.65]), Film(8, 8)
 SIDE = (2.5, 0, 0)
@@ -20,18 +22,72 @@ def plan_of(*objects, film=BANDS, look_from=(0, 0, 4), samples=4, depth=10):
 
 def test_a_scene_without_glass_needs_nothing():
     plan = plan_of(lamp((0, 0, 0), 1), Object(Plane([0, 0, 0], [0, 0, 1]), Emitter([1, 1, 1])))
-    assert (plan.balls, plan.lamps, plan.planes) == (0, 1, 1)
-    assert not any((plan.dispersive, plan.checkered, plan.nested, plan.random))
+    assert (plan.balls, plan.lamps, plan.screens) == (0, 1, 1)
+    assert not any((plan.dispersive, plan.nested, plan.random, plan.scattering, plan.lit))
+    assert plan.tiled == plan.cubed == (False, False)
 
 
 def test_the_bench():
     plan = make_plan(bench(), BANDS, 4, 10, "float64")
-    assert (plan.balls, plan.lamps, plan.planes) == (1, 0, 1)
+    assert (plan.balls, plan.lamps, plan.screens) == (1, 0, 1)
     assert plan.dispersive
-    assert plan.checkered
-    assert not plan.nested
-    assert not plan.random
-    assert not plan.colour
+    assert (plan.tiled, plan.cubed) == ((False, True), (False, False))
+    assert not any((plan.nested, plan.random, plan.scattering))
+    assert plan.bands == 3
+
+
+# One of each kind that sends paths on, and two that end them, in no order.
+EVERYTHING = (
+    lamp((0, 9, 0), 1),
+    ground(Metal([0.5] * 3), -2.0),
+    matte(0.5, (5, 0, 0)),
+    screen(z=-9.0),
+    metal(0.5, (0, 5, 0)),
+    ground(Lambertian([0.5] * 3), -1.5),
+    ball("N-BK7"),
+)
+
+
+def test_surfaces_are_numbered_by_what_becomes_of_a_path():
+    plan, scene = plan_of(*EVERYTHING), Scene(camera(), EVERYTHING)
+    order = [(type(o.material).__name__, type(o.shape).__name__) for o in surfaces_of(scene)]
+    assert order == [
+        ("Dielectric", "Sphere"),
+        ("Metal", "Sphere"),
+        ("Lambertian", "Sphere"),
+        ("Lambertian", "Plane"),
+        ("Metal", "Plane"),
+        ("Emitter", "Sphere"),
+        ("Emitter", "Plane"),
+    ]
+    assert plan.mattes == (2, 4)
+    assert (plan.first_plane, plan.first_lamp, plan.background) == (3, 5, 7)
+    assert (plan.spheres, plan.planes, plan.metals) == (4, 3, 2)
+
+
+@pytest.mark.parametrize(
+    ("objects", "lit", "random", "numbers"),
+    [
+        ((matte(0.5), lamp(SIDE, 1)), True, True, 5),
+        ((matte(0.5),), False, True, 2),
+        ((metal(0.5), lamp(SIDE, 1)), False, False, 0),
+        ((metal(0.5, fuzz=0.1),), False, True, 3),
+        ((metal(0.5), ball(1.5, SIDE)), False, True, 1),
+    ],
+)
+def test_what_bounces_draw_numbers_for(objects, lit, random, numbers):
+    plan = plan_of(*objects)
+    assert plan.scattering
+    assert (plan.lit, plan.random, plan.numbers_per_bounce) == (lit, random, numbers)
+
+
+def test_textures_are_told_apart_by_where_they_are():
+    cubes, tiles = Checker([1] * 3, [0] * 3), Checker2D([1] * 3, [0] * 3, 0.5)
+    shining = Object(Sphere(SIDE, 1.0), Emitter(cubes))
+    assert plan_of(ground(Lambertian(cubes))).cubed == (True, False)
+    assert plan_of(matte(0.5), shining).cubed == (False, True)
+    assert plan_of(ground(Metal(tiles)), screen(z=-9.0)).tiled == (True, True)
+    assert plan_of(ground(Metal(tiles))).tiled == (True, False)
 
 
 def test_two_balls_choose_branches():
@@ -81,9 +137,17 @@ def test_a_constant_index_does_not_disperse():
 
 def test_colour_samples_carry_several_wavelengths():
     plan = plan_of(ball("N-BK7"), film=COLOR)
-    assert plan.colour
+    assert plan.bands == 0
     assert plan.wavelengths_per_sample > 1
     assert plan_of(ball("N-BK7")).wavelengths_per_sample == 1
+    assert plan_of(ball("N-BK7"), matte(0.5, SIDE), film=COLOR).wavelengths_per_sample > 1
+
+
+def test_a_path_carries_what_its_film_needs():
+    glass, dull = ball("N-BK7"), matte(0.5, SIDE)
+    assert plan_of(glass).channels == plan_of(glass, dull).channels == 1  # a path for each band
+    assert plan_of(ball(1.5), dull, film=Film(8, 8, wavelengths=[0.5] * 5)).channels == 5
+    assert plan_of(glass, film=COLOR).channels == plan_of(dull, film=COLOR).channels == 3
 
 
 def test_of_traced_numbers_the_general_case_is_assumed():
@@ -93,9 +157,10 @@ def test_of_traced_numbers_the_general_case_is_assumed():
         plans.append(make_plan(scene, BANDS, 4, 10, "float64"))
         return scene.camera.look_from
 
-    jax.jit(traced)(furnace(ball(1.5)))
+    jax.jit(traced)(furnace(ball(1.5), metal(0.5, (0, 5, 0))))
     assert plans[0].dispersive
     assert plans[0].nested
+    assert plans[0].fuzzy
 
 
 def test_equal_plans_are_one_program():
@@ -111,12 +176,12 @@ def test_nothing_to_trace_is_refused(samples, depth):
 
 def test_printed_plan_of_the_bench():
     assert str(make_plan(bench(), BANDS, 6, 10, "float32")).splitlines() == [
-        "objects    1 glass, 0 lamps, 1 planes",
+        "objects    1 glass, 1 shining plane",
         "samples    6 a pixel, 3 x 2 grid",
         "depth      10 segments",
         "dtype      float32",
         "spectrum   one path for each band",
-        "checker    over the footprint",
+        "checker    2-D, over the footprint",
         "media      separate balls",
         "branches   summed, no noise",
     ]
@@ -125,7 +190,33 @@ def test_printed_plan_of_the_bench():
 @pytest.mark.parametrize(
     ("objects", "film", "lines"),
     [
-        ((lamp((0, 0, 0), 1),), BANDS, ["depth      1: no glass", "spectrum   none: no glass"]),
+        (
+            (lamp((0, 0, 0), 1),),
+            BANDS,
+            ["objects    1 lamp", "depth      1: nothing sends light on", "spectrum   none: no glass"],
+        ),
+        ((), BANDS, ["objects    none"]),
+        (
+            EVERYTHING[:3] + EVERYTHING[4:],
+            COLOR,
+            [
+                "objects    1 glass, 2 matte, 2 metal, 1 lamp",
+                "depth      10 segments",
+                "spectrum   2 wavelengths a sample, 8 strata",
+                "branches   chosen",
+                "lamps      sampled directly",
+            ],
+        ),
+        (
+            (metal(0.5), lamp(SIDE, 1)),
+            COLOR,
+            ["objects    1 metal, 1 lamp", "branches   none", "lamps      found by chance"],
+        ),
+        (
+            (ground(Lambertian(Checker([1] * 3, [0] * 3))), screen(z=-9.0)),
+            COLOR,
+            ["objects    1 matte, 1 shining plane", "checker    2-D and 3-D, at points"],
+        ),
         ((ball(1.5),), COLOR, ["spectrum   none: nothing disperses", "checker    not compiled"]),
         (
             (ball("N-BK7"), ball(1.5, SIDE)),

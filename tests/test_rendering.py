@@ -19,7 +19,7 @@ from helpers import (
     screen,
 )
 
-from diffdisp import rendering
+from diffdisp import chunks, rendering
 from diffdisp.camera import Camera
 from diffdisp.dispersion import Sellmeier
 from diffdisp.film import Film
@@ -413,7 +413,7 @@ def test_under_jit_a_render_is_the_same():
 
 
 def programs():
-    return rendering.render_chunks_jit._cache_size()
+    return chunks.render_chunks_jit._cache_size()
 
 
 def test_other_numbers_are_no_other_program():
@@ -455,7 +455,7 @@ def test_the_picture_does_not_depend_on_threads(monkeypatch):
     film = Film(64, 64, wavelengths=[0.45, 0.65])
     scene = furnace(*SEPARATE["apart"], color=[0.1, 0.2, 0.3])
     many = render(scene, film, samples=4, depth=50)
-    monkeypatch.setattr(rendering.os, "cpu_count", lambda: 1)
+    monkeypatch.setattr(chunks, "workers", lambda: 1)
     np.testing.assert_array_equal(render(scene, film, samples=4, depth=50), many)
 
 

@@ -27,10 +27,14 @@ QUALITY = {"draft": 4, "standard": 16, "reference": 256}
 WARM_RENDERS = 5
 """Renders whose median is told as the time of one."""
 
+PICTURES = 4
+"""Held at once: a pass in the order of chunks and in that of rows, the sum, the picture so far."""
 PIXEL_BYTES = 128
 """Beside the radiance: places of a pixel and their order, while chunks are laid out."""
-SAMPLE_BYTES = 1024
-"""Of one path: its state of some hundred numbers. All samples of a pixel are traced at once."""
+SAMPLE_BYTES = 1200
+"""Of a film sample, for all pixels: its wavelengths and what they count, while laid out."""
+PATH_BYTES = 1024
+"""Of one path: its state of some hundred numbers. A pixel's samples in a pass are traced at once."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -262,7 +266,7 @@ def _render(options: argparse.Namespace) -> int:
     scene = load_scene(options.scene)
     samples = options.samples or QUALITY[options.quality]
     depth, dtype = options.depth, "float64" if options.float64 else "float32"
-    film = _film(options.size, options.bands, samples)
+    film = _film(options.size, options.bands, samples, dtype)
     if options.output:
         check_output(options.output, film.wavelengths)
     _check_glasses(scene, options.bands)
@@ -288,11 +292,13 @@ def _render(options: argparse.Namespace) -> int:
     return DONE
 
 
-def _film(size: tuple[int, int], bands: tuple[float, float, int] | None, samples: int) -> Any:
+def _film(
+    size: tuple[int, int], bands: tuple[float, float, int] | None, samples: int, dtype: str
+) -> Any:
     """The film asked for, if there is memory for it."""
     from diffdisp.film import Film, band_middles
 
-    _check_memory(*size, bands[2] if bands else 3, samples)
+    _check_memory(*size, bands[2] if bands else 3, samples, 8 if dtype == "float64" else 4)
     return Film(*size, band_middles(*bands) if bands else None)
 
 
@@ -453,15 +459,17 @@ def _source(asked_for: str) -> str:
 # What the machine can do.
 
 
-def _check_memory(width: int, height: int, channels: int, samples: int) -> None:
+def _check_memory(width: int, height: int, channels: int, samples: int, real_bytes: int) -> None:
     """Refuse, before any work, a picture that cannot be held.
 
     Raises:
         MemoryError: it cannot.
     """
-    # The radiance in the order of chunks and in that of rows, at most in double precision.
-    pixels = width * height * (2 * 8 * channels + PIXEL_BYTES)
-    needed, available = pixels + samples * channels * SAMPLE_BYTES, _available_memory()
+    from diffdisp.wavefront import MOST_SAMPLES
+
+    pixels = width * height * (PICTURES * real_bytes * channels + PIXEL_BYTES)
+    paths = min(samples, MOST_SAMPLES) * channels * PATH_BYTES
+    needed, available = pixels + paths + samples * SAMPLE_BYTES, _available_memory()
     if needed > available:
         raise MemoryError(
             f"{width}x{height} pixels of {channels} channels with {samples} samples need about "

@@ -195,7 +195,7 @@ def all_spheres(world: World, plan: Plan, one: Array | None) -> Candidates:
     spare = groups * group - plan.spheres
 
     def filled(row: Array) -> Array:
-        return jnp.pad(jnp.asarray(row), (0, spare))
+        return jnp.pad(jnp.asarray(row), (0, spare)) if spare else jnp.asarray(row)
 
     return Candidates(
         Vec3(*map(filled, world.centers)),
@@ -734,10 +734,12 @@ def _one_way(path: Path, setting: Setting) -> Path:
         assert scattered.spectral is not None
         counts = counts & (setting.always | scattered.spectral)
     if plan.lit:
-        shown = once(lambda: _lamplight(path, counts, scattered, setting), setting.one)
+        shown = _lamplight(path, counts, scattered, setting)
         radiance = tuple(r + x for r, x in zip(radiance, shown, strict=True))
     spheres = all_spheres(tables.world, plan, setting.one)
-    surface = nearest(moved.ray, tables.world, plan, path.surface, spheres)
+    surface = once(
+        lambda: nearest(moved.ray, tables.world, plan, path.surface, spheres), setting.one
+    )
     light = emitted(surface, moved, tables, plan)
     arrives = counts & scattered.goes_on & (surface >= plan.first_lamp)
     factor = jnp.where(arrives, 1.0, 0.0)
@@ -837,12 +839,12 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
                     for t, w in zip(throughput, setting.weights, strict=True)
                 )
         ray = Ray(point, direction)
-        scattered = Scattered(
+        return Scattered(
             ray, throughput, goes_on, differ, is_matte, None, None, None, None, None, spectral
         )
-        return _aim(scattered, facing, draw, setting) if plan.lit else scattered
 
-    return once(finished, setting.one)
+    scattered = once(finished, setting.one)
+    return _aim(scattered, facing, draw, setting) if plan.lit else scattered
 
 
 def _parted(
@@ -932,17 +934,23 @@ def _aim(
         _luminances(paint, plan),
         np.arange(plan.lamps, dtype=np.int32),
     )
-    start = (zero, jnp.zeros(zero.shape, jnp.int32), draw(2))
-    total, lamp, _ = _over(weigh, start, rows, plan.lamps)
 
-    center = _pick_vector(centers, lamp)
-    radius = _pick(rows[1], lamp)
-    offset = center - point
-    squared = offset.dot(offset)
-    axis = offset * (1.0 / jnp.sqrt(squared))
-    drop = draw(3) * _cap(jnp.minimum(radius * radius / squared, 1.0))
-    turned = uniform_direction(0.5 * drop, draw(4))
-    direction = _turn_to(axis, turned)
+    def choice() -> tuple[Real, Array]:
+        """The sum of all lamps' weights, and the number of one of them."""
+        start = (zero, jnp.zeros(zero.shape, jnp.int32), draw(2))
+        total, lamp, _ = _over(weigh, start, rows, plan.lamps)
+        return total, lamp
+
+    total, lamp = once(choice, setting.one)
+
+    def aim() -> tuple[Vec3, Vec3]:
+        """The axis of the lamp's cone, and a direction in the cone as if its axis were x."""
+        radius, offset = _pick(rows[1], lamp), _pick_vector(centers, lamp) - point
+        squared = offset.dot(offset)
+        drop = draw(3) * _cap(jnp.minimum(radius * radius / squared, 1.0))
+        return offset * (1.0 / jnp.sqrt(squared)), uniform_direction(0.5 * drop, draw(4))
+
+    direction = _turn_to(*once(aim, setting.one))
     cosine = facing.dot(direction)
     chosen = jnp.maximum(facing.dot(scattered.ray.direction), 0.0) / np.pi
     density = _pick(rows[2], lamp) / (2.0 * np.pi * jnp.where(total > 0, total, 1.0))
@@ -999,8 +1007,8 @@ def _lamplight(path: Path, counts: Array, scattered: Scattered, setting: Setting
     assert scattered.to_lamp is not None
     assert scattered.lamp_share is not None
     to_lamp = path._replace(ray=scattered.to_lamp)
-    spheres = all_spheres(tables.world, plan, setting.one)
-    surface = nearest(scattered.to_lamp, tables.world, plan, path.surface, spheres)
+    ray, spheres = scattered.to_lamp, all_spheres(tables.world, plan, setting.one)
+    surface = once(lambda: nearest(ray, tables.world, plan, path.surface, spheres), setting.one)
     assert scattered.lamp is not None
     light = emitted(scattered.lamp, to_lamp, tables, plan)
     factor = jnp.where(counts & (surface == scattered.lamp), scattered.lamp_share, 0.0)

@@ -66,7 +66,14 @@ def choose(condition: Array | bool, a: Any, b: Any) -> Any:
     """`a` where the condition holds, else `b`, leaf by leaf; known conditions cost nothing."""
     if isinstance(condition, bool):
         return a if condition else b
-    return jax.tree.map(lambda p, q: jnp.where(condition, p, q), a, b)
+
+    def either(p: Array, q: Array) -> Array:
+        alike = jnp.shape(condition) == jnp.shape(p) == jnp.shape(q)
+        if alike and jnp.result_type(p) == jnp.result_type(q):
+            return jax.lax.select(condition, p, q)  # a tenth of the time to trace
+        return jnp.where(condition, p, q)
+
+    return jax.tree.map(either, a, b)
 
 
 def least_square(like: Real) -> float:

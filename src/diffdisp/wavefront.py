@@ -198,7 +198,7 @@ def _in_view(
         return _unit(forward + right * across[:, None] - upward * down[:, None])
 
     axis = toward(edge / 2, edge / 2)
-    corners = [toward(dx, dy) for dx in (0, edge) for dy in (0, edge)]
+    corners = [toward(dx, dy) for dx in (0.0, float(edge)) for dy in (0.0, float(edge))]
     cosine = np.min([np.sum(axis * corner, axis=1) for corner in corners], axis=0)[:, None]
     if not spheres:
         return np.zeros((len(x), 0), bool)
