@@ -193,7 +193,11 @@ def test_printed_plan_of_the_bench():
         (
             (lamp((0, 0, 0), 1),),
             BANDS,
-            ["objects    1 lamp", "depth      1: nothing sends light on", "spectrum   none: no glass"],
+            [
+                "objects    1 lamp",
+                "depth      1: nothing sends light on",
+                "spectrum   none: no glass",
+            ],
         ),
         ((), BANDS, ["objects    none"]),
         (

@@ -34,7 +34,7 @@ PIXEL_BYTES = 128
 SAMPLE_BYTES = 1200
 """Of a film sample, for all pixels: its wavelengths and what they count, while laid out."""
 PATH_BYTES = 1024
-"""Of one path: its state of some hundred numbers. A pixel's samples in a pass are traced at once."""
+"""Of one path: its state of some hundred numbers. All of a pixel in a pass are traced at once."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,6 +1,5 @@
 """The pixels of a picture in chunks, each followed to its end: what pictures and fits share."""
 
-import itertools
 import os
 import threading
 import warnings
@@ -234,11 +233,11 @@ def in_threads(
     results = []
     with ThreadPoolExecutor(min(workers(), len(parts))) as pool:
         try:
-            first = (pool.submit(work, part).result() for part in parts[:alone])
-            for result in itertools.chain(first, pool.map(work, parts[alone:])):
-                results.append(result)
-                if progress:
-                    progress(len(results), len(parts))
+            for together in (parts[:alone], parts[alone:]):
+                for result in pool.map(work, together):
+                    results.append(result)
+                    if progress:
+                        progress(len(results), len(parts))
         except BaseException:
             stop.set()
             raise

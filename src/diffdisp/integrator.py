@@ -967,7 +967,7 @@ def _aim(
     )
 
 
-def _luminances(paint: Paint, plan: Plan) -> Real:
+def _luminances(paint: Paint, plan: Plan) -> Float[Array, " lamps"]:
     """A number for the brightness of each lamp: the mean of its channels."""
     first = plan.first_lamp - plan.balls
     brightness = [mean[first : first + plan.lamps] for mean in paint.mean]

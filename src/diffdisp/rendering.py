@@ -49,7 +49,7 @@ from diffdisp.wavefront import (
 )
 
 PASS_PATHS = 1 << 24
-"""Film samples of a pass over the picture: what a growing picture grows by, about a second."""
+"""Film samples of a pass over the picture, which a growing picture grows by: a second or a few."""
 
 Progress = Callable[[int, int], None]
 
