@@ -8,7 +8,7 @@ PYTHON = $(shell for python in python3.11 python3; do \
 	&& echo $$python && break; done)
 
 .DELETE_ON_ERROR:
-.PHONY: demo test check bench notebooks lock clean
+.PHONY: demo test check bench gallery notebooks lock clean
 
 demo: $(READY)  ## draw a glass ball, then recover its glass from a picture
 	@mkdir -p out/demo
@@ -30,6 +30,14 @@ check: $(READY)  ## format, lint, types
 bench: $(READY)  ## every script of benchmarks/
 	@for script in $(sort $(wildcard benchmarks/*.py)); do \
 		echo "== $$script"; $(PY) $$script || exit 1; done
+
+# Light that a ball of glass gathers is found by chance: the lamps take more samples than the others.
+gallery: $(READY)  ## the pictures of docs/gallery.md
+	@mkdir -p docs/gallery
+	$(PY) -m diffdisp render fixtures/scenes/dispersion.toml -o docs/gallery/dispersion.png --size 640x480 --samples 512 --seed 0
+	$(PY) -m diffdisp render fixtures/scenes/metal_and_matte.toml -o docs/gallery/metal_and_matte.png --size 640x480 --samples 1024 --seed 0
+	$(PY) -m diffdisp render fixtures/scenes/lamps.toml -o docs/gallery/lamps.png --size 640x480 --samples 2048 --seed 0
+	$(PY) -m diffdisp render fixtures/scenes/default.toml -o docs/gallery/default.png --size 640x480 --samples 1024 --seed 0
 
 notebooks: $(READY)  ## run every notebook; the executed copies go to out/notebooks/
 	@mkdir -p out/notebooks

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers import numbers
 
-from diffdisp.geometry import Ray, plane_axes, plane_distance, sphere_distances
+from diffdisp.geometry import Ray, first_distance, plane_axes, plane_distance, sphere_distances
 from diffdisp.vector import Vec3, vec3
 
 RNG = np.random.default_rng(1)
@@ -119,6 +119,151 @@ def test_gradients_by_hand(x):
         by_x, [x / root, -x / root], rtol=0, atol=1e-14
     )  # some ten roundings
     np.testing.assert_allclose(by_radius, [-1 / root, 1 / root], rtol=0, atol=1e-14)
+
+
+# --- the first point ahead
+
+
+def first(origins, directions, center, radius, on=False):
+    """`first_distance` of many rays (N, 3), in the dtype of the arrays."""
+    rays = Ray(Vec3(*jnp.asarray(origins).T), Vec3(*jnp.asarray(directions).T))
+    sphere = vec3(jnp.asarray(center)), jnp.asarray(radius)
+    one = jax.vmap(lambda r: first_distance(r, *sphere, jnp.asarray(on)))
+    return [np.asarray(part) for part in jax.jit(one)(rays)]
+
+
+@pytest.mark.parametrize(
+    ("origin", "direction", "on", "distance"),
+    [
+        ((0, 0, 3), (0, 0, -1), False, 2),
+        ((0, 0.6, 3), (0, 0, -1), False, 2.2),
+        ((0, 0, 0.5), (0, 0, -1), False, 1.5),  # inside
+        ((0, 0, 0.5), (0, 0, 1), False, 0.5),
+        ((0, 0, 0), (0.6, 0.8, 0), False, 1),
+        ((0, 0, 1), (0, 0, -1), True, 2),  # on it, inwards: a chord
+        ((0, 0, 1), (0.6, 0, -0.8), True, 1.6),
+        ((0, 0, 1 + 1e-14), (0, 0, -1), False, 2),  # rounding away from it is on it
+        ((0, 0, 1 - 1e-14), (0, 0, -1), False, 2),
+        ((0, np.nextafter(1, 0), 3), (0, 0, -1), False, 3),  # next to a tangent
+    ],
+)
+def test_first_point_of_a_sphere(origin, direction, on, distance):
+    start = np.array([origin], float), np.array([direction], float)
+    found, meets = first(*start, np.zeros(3), 1.0, on)
+    assert meets
+    # Rounding; of the height 1e-14 it is half a turn's length, and next to the tangent its root.
+    np.testing.assert_allclose(found, distance, rtol=0, atol=3e-8 if distance == 3 else 2e-14)
+
+
+@pytest.mark.parametrize(
+    ("origin", "direction", "on"),
+    [
+        ((0, 2, 3), (0, 0, -1), False),  # beside it
+        ((0, 1, 3), (0, 0, -1), False),  # a tangent
+        ((0, 0, 3), (0, 0, 1), False),  # behind
+        ((0, 0.6, 3), (0, 0, 1), False),
+        ((0, 0, 1), (0, 0, 1), True),  # on it, outwards
+        ((0, 0, 1), (0.6, 0, 0.8), True),
+        ((0, 0, 1), (1, 0, 0), True),  # along it
+        ((0, 0, 1 + 1e-14), (0.6, 0, 0.8), False),
+        ((0, 0, 1 - 1e-14), (0.6, 0, 0.8), False),
+    ],
+)
+def test_no_point_of_a_sphere_ahead(origin, direction, on):
+    start = np.array([origin], float), np.array([direction], float)
+    assert not first(*start, np.zeros(3), 1.0, on)[1]
+
+
+@pytest.mark.parametrize("scale", [0.3, 0.99, 2.0, 30.0])
+def test_first_point_is_the_least_positive_root(scale):
+    origins = scale * unit(RNG.normal(size=(500, 3)))
+    directions = unit(RNG.uniform(-1.2, 1.2, size=(500, 3)) - origins)
+    found, meets = first(origins, directions, np.zeros(3), 1.0)
+    near, far, hit = truth(origins, directions, np.zeros(3), 1.0)
+    expected = np.where(near > 0, near, far)
+    np.testing.assert_array_equal(meets, hit & (expected > 0))
+    # As of both distances.
+    np.testing.assert_allclose(
+        found[meets], expected[meets], rtol=0, atol=1e-13 * (1 + scale) ** 2
+    )
+
+
+EPS = 2.0**-24
+"""Largest relative rounding error of float32."""
+
+
+@pytest.mark.parametrize("within", [False, True])
+def test_first_point_of_a_large_sphere_in_float32(within):
+    # From 1 above or below the surface of a sphere of radius 1e4, towards it.
+    radius = 1e4
+    up = unit(RNG.normal(size=(2000, 3)))
+    origins = ((radius + (-1.0 if within else 1.0)) * up).astype(np.float32)
+    directions = unit(RNG.normal(size=(2000, 3)))
+    directions -= up * (directions * up).sum(-1, keepdims=True)
+    cosine = RNG.uniform(0.1, 1.0, (2000, 1))
+    directions = unit(directions) * np.sqrt(1 - cosine**2) - up * cosine * (-1 if within else 1)
+    directions = directions.astype(np.float32)
+    with jax.enable_x64(False):
+        found, meets = first(origins, directions, np.zeros(3, np.float32), np.float32(radius))
+    assert found.dtype == np.float32
+    near, far, _ = truth(origins, unit(directions.astype(float)), np.zeros(3), radius)
+    assert meets.all()
+    # Some five roundings of o² - r², of 1e8 each; over the divisor, 2 r cos.
+    error = np.abs(found - (far if within else near)) * 2 * radius * cosine[:, 0]
+    assert error.max() < 5 * EPS * radius**2
+
+
+def test_first_point_of_a_far_small_sphere_in_float32():
+    # The unit ball at distance 1e4, as of both distances above.
+    impact, turn = RNG.uniform(0, 2, 2000), RNG.uniform(0, 2 * np.pi, 2000)
+    targets = np.stack([impact * np.cos(turn), impact * np.sin(turn), 0 * impact], -1)
+    origins = np.zeros((2000, 3), np.float32) + np.float32([0, 0, 1e4])
+    directions = unit(targets - origins).astype(np.float32)
+    with jax.enable_x64(False):
+        found, meets = first(origins, directions, np.zeros(3, np.float32), np.float32(1))
+    near, _, hit = truth(origins, unit(directions.astype(float)), np.zeros(3), 1.0)
+    clear = np.abs(impact - 1) > 2e-3
+    np.testing.assert_array_equal(meets[clear], hit[clear])
+    # One rounding of o² - r², of the divisor and of their quotient each: 1e4 · 3 ε, and the root's.
+    sure = clear & hit
+    np.testing.assert_allclose(found[sure], near[sure], rtol=0, atol=0.03)
+
+
+def first_of(x, z, radius, on):
+    """The distance for a ray along -z beside the axis."""
+    start = Ray(Vec3(x, jnp.zeros(()), z), vec3(jnp.array([0, 0, -1.0])))
+    return first_distance(start, vec3(jnp.zeros(3)), radius, on)[0]
+
+
+FIRST_FORWARD = jax.jit(jax.jacfwd(first_of, argnums=(0, 1, 2)))
+FIRST_REVERSE = jax.jit(jax.jacrev(first_of, argnums=(0, 1, 2)))
+FIRST_SECOND = jax.jit(jax.jacfwd(jax.jacrev(first_of)))
+
+
+@pytest.mark.parametrize("x", [0.0, 0.5, np.nextafter(1, 0), 1.0, np.nextafter(1, 2), 2.0])
+@pytest.mark.parametrize("z", [3.0, 0.5, 0.0, -3.0])
+@pytest.mark.parametrize("mode", [FIRST_FORWARD, FIRST_REVERSE, FIRST_SECOND])
+@pytest.mark.parametrize("on", [False, True])
+def test_gradients_of_the_first_point_are_finite(x, z, mode, on):
+    slopes = mode(jnp.array(x), jnp.array(z), jnp.array(1.0), jnp.array(on))
+    assert all(np.isfinite(slope).all() for slope in jax.tree.leaves(slopes))
+
+
+@pytest.mark.parametrize(("z", "sign"), [(3.0, -1), (0.2, 1)])
+@pytest.mark.parametrize("x", [0.0, 0.6, 0.8])
+def test_gradients_of_the_first_point_by_hand(x, z, sign):
+    # z - √(1 - x²) from outside, z + √(1 - x²) from inside.
+    by_x, by_z, by_radius = FIRST_FORWARD(
+        jnp.array(x), jnp.array(z), jnp.array(1.0), jnp.array(False)
+    )
+    root = np.sqrt(1 - x * x)
+    expected = [-sign * x / root, 1, sign / root]
+    np.testing.assert_allclose(
+        [by_x, by_z, by_radius], expected, rtol=0, atol=1e-14
+    )  # some ten roundings
+
+
+# --- planes
 
 
 @pytest.mark.parametrize(

@@ -73,7 +73,7 @@ def run_numbers(
         cells: (passes, samples) cells of the film of all passes, of which the first is run; by
             default the plan's samples are all.
     """
-    least = 0.1 * float(np.finfo(plan.dtype).eps) if cutoff is None else cutoff
+    least = 4.0 * float(np.finfo(plan.dtype).eps) if cutoff is None else cutoff
     taken = np.arange(plan.samples) if cells is None else cells[0]
     columns, rows = sample_grid(plan.samples if cells is None else cells.size)
     return RunNumbers(
@@ -132,7 +132,7 @@ def check_glasses(scene: Scene, low: float, high: float) -> None:
 
 def chunk_pixels(film: Film, plan: Plan) -> int:
     """Pixels of a chunk: few enough that its paths stay in the cache, enough to fill a GPU."""
-    lanes = {"cpu": 2048}.get(jax.default_backend(), 1 << 18)
+    lanes = {"cpu": 16384 // np.dtype(plan.dtype).itemsize}.get(jax.default_backend(), 1 << 18)
     waves = plan.wavelengths_per_sample if film.wavelengths is None else film.channels
     return int(np.clip(lanes // (plan.samples * (waves if plan.dispersive else 1)), 1, 1024))
 
