@@ -37,7 +37,7 @@ gallery: $(READY)  ## the pictures of docs/gallery.md
 	$(PY) -m diffdisp render fixtures/scenes/dispersion.toml -o docs/gallery/dispersion.png --size 640x480 --samples 512 --seed 0
 	$(PY) -m diffdisp render fixtures/scenes/metal_and_matte.toml -o docs/gallery/metal_and_matte.png --size 640x480 --samples 1024 --seed 0
 	$(PY) -m diffdisp render fixtures/scenes/lamps.toml -o docs/gallery/lamps.png --size 640x480 --samples 2048 --seed 0
-	$(PY) -m diffdisp render fixtures/scenes/default.toml -o docs/gallery/default.png --size 640x480 --samples 1024 --seed 0
+	$(PY) -m diffdisp render fixtures/scenes/default.toml -o docs/gallery/default.png --size 640x480 --samples 512 --seed 0
 
 notebooks: $(READY)  ## run every notebook; the executed copies go to out/notebooks/
 	@mkdir -p out/notebooks

@@ -5,11 +5,21 @@ from collections.abc import Sequence
 import numpy as np
 
 from diffdisp.camera import Camera
+from diffdisp.chunks import (
+    all_pixels,
+    chunk_pixels,
+    film_size,
+    film_spectrum,
+    over_chunks,
+    render_chunks_jit,
+    run_numbers,
+)
 from diffdisp.dispersion import Sellmeier
 from diffdisp.film import Film
 from diffdisp.geometry import Plane, Sphere
 from diffdisp.material import Dielectric, Emitter, Lambertian, Material, Metal
-from diffdisp.scene import Background, Object, Scene
+from diffdisp.planning import make_plan
+from diffdisp.scene import Background, Object, Scene, without_names
 from diffdisp.texture import Checker2D
 from diffdisp.vector import Vec3
 
@@ -122,3 +132,17 @@ def deviation(incidence: float, n: float, order: int) -> float:
     """D_p = 2(i - r) + p(π - 2r): p = 0 is straight through, p = -1 the outer reflection."""
     refraction = np.arcsin(np.sin(incidence) / n)
     return 2.0 * (incidence - refraction) + order * (np.pi - 2.0 * refraction)
+
+
+def direct(
+    scene: Scene, film: Film, *, samples: int, depth: int, seed: int = 0, dtype: str = "float64"
+) -> np.ndarray:
+    """The picture by the loop that fits and transformations use, for any scene."""
+    plan = make_plan(scene, film, samples, depth, dtype)
+    pixels, place = all_pixels(film, chunk_pixels(film, plan))
+    fixed = plan, without_names(scene), film_spectrum(film, plan), film_size(film)
+    run = run_numbers(plan, seed)
+    values = over_chunks(
+        lambda part: np.asarray(render_chunks_jit(*fixed, part, run)), pixels, dtype
+    )
+    return values.reshape(-1, film.channels)[place].reshape(film.height, film.width, film.channels)

@@ -183,9 +183,7 @@ def test_first_point_is_the_least_positive_root(scale):
     expected = np.where(near > 0, near, far)
     np.testing.assert_array_equal(meets, hit & (expected > 0))
     # As of both distances.
-    np.testing.assert_allclose(
-        found[meets], expected[meets], rtol=0, atol=1e-13 * (1 + scale) ** 2
-    )
+    np.testing.assert_allclose(found[meets], expected[meets], rtol=0, atol=1e-13 * (1 + scale) ** 2)
 
 
 EPS = 2.0**-24

@@ -175,6 +175,7 @@ class Candidates(NamedTuple):
         numbers: of the surfaces.
         groups: how many groups of `group` rows count.
         group: rows of a group, which are taken together.
+        several: whether there may be more groups than one.
     """
 
     centers: Vec3
@@ -182,6 +183,7 @@ class Candidates(NamedTuple):
     numbers: Int[Array, " rows"]
     groups: Int[Array, ""] | int
     group: int
+    several: bool
 
 
 MOST_TOGETHER = 8
@@ -201,8 +203,9 @@ def all_spheres(world: World, plan: Plan, one: Array | None) -> Candidates:
         Vec3(*map(filled, world.centers)),
         filled(world.radii),
         filled(surface_numbers(plan)[0]),
-        groups if one is None or groups < 2 else groups * one,
+        groups if one is None else groups * one,
         group,
+        groups > 1,
     )
 
 
@@ -244,8 +247,9 @@ def nearest(ray: Ray, world: World, plan: Plan, last: Array, spheres: Candidates
     none = jax.lax.bitcast_convert_type(jnp.full_like(ray.origin.x, jnp.inf), word)
     best: Array = none
     group: Array = jnp.zeros_like(last)
-    if isinstance(spheres.groups, int) and spheres.groups == 1:
-        best = of_group(0)
+    if spheres.group and not spheres.several:
+        # A loop, as in `once`; and what a loop counts it does not lay out beforehand, row by row.
+        best = jax.lax.fori_loop(0, spheres.groups, lambda turn, _: of_group(turn), none)
     elif spheres.group:
 
         def turn(number: Array, carried: Any) -> Any:
@@ -737,9 +741,7 @@ def _one_way(path: Path, setting: Setting) -> Path:
         shown = _lamplight(path, counts, scattered, setting)
         radiance = tuple(r + x for r, x in zip(radiance, shown, strict=True))
     spheres = all_spheres(tables.world, plan, setting.one)
-    surface = once(
-        lambda: nearest(moved.ray, tables.world, plan, path.surface, spheres), setting.one
-    )
+    surface = nearest(moved.ray, tables.world, plan, path.surface, spheres)
     light = emitted(surface, moved, tables, plan)
     arrives = counts & scattered.goes_on & (surface >= plan.first_lamp)
     factor = jnp.where(arrives, 1.0, 0.0)
@@ -1008,7 +1010,7 @@ def _lamplight(path: Path, counts: Array, scattered: Scattered, setting: Setting
     assert scattered.lamp_share is not None
     to_lamp = path._replace(ray=scattered.to_lamp)
     ray, spheres = scattered.to_lamp, all_spheres(tables.world, plan, setting.one)
-    surface = once(lambda: nearest(ray, tables.world, plan, path.surface, spheres), setting.one)
+    surface = nearest(ray, tables.world, plan, path.surface, spheres)
     assert scattered.lamp is not None
     light = emitted(scattered.lamp, to_lamp, tables, plan)
     factor = jnp.where(counts & (surface == scattered.lamp), scattered.lamp_share, 0.0)

@@ -290,6 +290,7 @@ def _first_hits(
             numbers[rows],
             tiles.groups[tile],
             GROUP,
+            True,
         )
 
         def one_sample(x: Array, y: Array, s: Array) -> tuple[tuple[Real, ...], Array]:
