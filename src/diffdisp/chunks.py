@@ -276,7 +276,34 @@ def film_spectrum(film: Film, plan: Plan) -> Spectrum:
         return Spectrum(np.array([sum(COLOR_RANGE) / 2]), basis, None)
     if film.wavelengths is not None:
         return Spectrum(np.asarray(film.wavelengths), basis, None)
-    count, samples = plan.wavelengths_per_sample, plan.samples
+    if not plan.scattering:
+        return Spectrum(*_strata(plan.samples, plan.wavelengths_per_sample))
+    # Each sample is followed at a middle wavelength in all channels, and where that path meets
+    # dispersive glass, by the same numbers at a wavelength of its own: what this one shows
+    # otherwise than the middle one is the dispersion, and hardly anything else of it is noise.
+    wavelengths, _, weights = _strata(plan.samples, 1)
+    middle = np.full_like(wavelengths, np.median(wavelengths))
+    return Spectrum(
+        np.concatenate([middle, wavelengths]),
+        None,
+        np.concatenate([1.0 / plan.samples - weights, weights]),
+    )
+
+
+def with_split_paths(spectrum: Spectrum, plan: Plan) -> Spectrum:
+    """The spectrum with the wavelengths of samples that the camera sees through glass."""
+    if spectrum.weights is None:
+        return spectrum
+    wavelengths, _, weights = _strata(plan.samples, plan.wavelengths_per_sample)
+    return Spectrum(
+        np.concatenate([spectrum.wavelengths, wavelengths]),
+        None,
+        np.concatenate([spectrum.weights, weights]),
+    )
+
+
+def _strata(samples: int, count: int) -> tuple[np.ndarray, None, np.ndarray]:
+    """Wavelengths (count, samples) of a pixel's samples, and what they count in each channel."""
     wavelengths, weights = wavelength_strata(count * samples)
     # Each sample takes every `samples`-th stratum. A step near the golden section keeps the
     # strata of neighbouring samples far apart.
@@ -284,16 +311,7 @@ def film_spectrum(film: Film, plan: Plan) -> Spectrum:
         k for k in range(round(samples * 0.618) or 1, samples + 1) if np.gcd(k, samples) == 1
     )
     taken = np.arange(samples) * step % samples + np.arange(count)[:, None] * samples
-    if not plan.scattering:
-        return Spectrum(wavelengths[taken], None, weights[taken])
-    # Each sample is followed at a middle wavelength in all channels, and where that path meets
-    # dispersive glass, by the same numbers at wavelengths of its own: what these show otherwise
-    # than the middle one is the dispersion, and hardly anything else of it is noise.
-    middle = np.full((1, samples), wavelengths[wavelengths.size // 2])
-    rest = 1.0 / samples - weights[taken].sum(axis=0, keepdims=True)
-    return Spectrum(
-        np.concatenate([middle, wavelengths[taken]]), None, np.concatenate([rest, weights[taken]])
-    )
+    return wavelengths[taken], None, weights[taken]
 
 
 def glass_indices(scene: Scene, wavelengths: Array) -> tuple[Array, ...]:

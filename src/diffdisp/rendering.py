@@ -28,6 +28,7 @@ from diffdisp.chunks import (
     render_chunks,
     render_chunks_jit,
     run_numbers,
+    with_split_paths,
     workers,
 )
 from diffdisp.color import wavelength_strata
@@ -189,6 +190,7 @@ def _lay_out(scene: Scene, film: Film, samples: int, depth: int, dtype: str) -> 
         if plan.bands and plan.dispersive:  # each band is a picture of its own
             plan = replace(plan, bands=1)
         tiles = visible_tiles(scene, film, plan, tile_edge(share), workers())
+        spectrum = with_split_paths(spectrum, whole)
     return _Work(plan, without_names(scene), spectrum, cells.reshape(-1, share), tiles)
 
 

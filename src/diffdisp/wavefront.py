@@ -119,9 +119,9 @@ class Lane(NamedTuple):
         waiting: a bit for each sample that is still to come.
         sample: the present one.
         wave: the present one of the sample's wavelengths; None where none has any. The first is
-            the middle one, the others follow if its path has met dispersive glass.
-        way: what the sample meets first: glass, through which its path goes; glass that reflects
-            it; or nothing of glass. None as before.
+            the middle one; the second follows if the first one's path has met dispersive glass.
+        way: what the sample meets first: glass, through which its paths go at all but these two
+            wavelengths; glass that reflects it; or nothing of glass. None as before.
         path: the present path; its radiance is that of all the pixel's paths.
     """
 
@@ -136,7 +136,10 @@ class Lane(NamedTuple):
 
 
 NO_GLASS, THROUGH, REFLECTED = 0, 1, 2
-"""The ways of a lane. Through glass a sample goes at each wavelength but the first."""
+"""The ways of a lane. What has gone through glass is reflected by it after that."""
+
+FIRST_THROUGH = 2
+"""The first of a sample's wavelengths that go through glass."""
 
 
 def tile_edge(samples: int) -> int:
@@ -345,7 +348,7 @@ def _follow(
     advance = jax.vmap(lambda lane: _advance(lane, plan, view, samples, hits))
 
     def busy(lane: Lane) -> Array:
-        return lane.path.alive | (lane.waiting != 0) | _splits(lane, samples)
+        return lane.path.alive | (lane.waiting != 0) | _splits(lane)
 
     def collect(lane: Lane, results: tuple[Array, ...]) -> tuple[Array, ...]:
         slot = jnp.where(busy(lane), pixels, lane.slot)
@@ -444,20 +447,20 @@ def _advance(lane: Lane, plan: Plan, view: View, samples: FilmSamples, hits: Arr
     return lane._replace(path=bounce(lane.path, setting))
 
 
-def _splits(lane: Lane, samples: FilmSamples) -> Array:
+def _splits(lane: Lane) -> Array:
     """Whether a path has ended that others of its sample have to follow."""
     if lane.wave is None:
         return jnp.zeros_like(lane.path.alive)
     assert lane.way is not None
     assert lane.path.spectral is not None
-    more = lane.path.spectral & (lane.wave + 1 < samples.indices.shape[1])
+    more = lane.path.spectral & (lane.wave == 0)
     return ~lane.path.alive & (more | (lane.way == THROUGH))
 
 
 def _next_sample(lane: Lane, plan: Plan, view: View, samples: FilmSamples, hits: Array) -> Lane:
     """The lane with the path of its next sample or wavelength, where the present one has ended."""
     lowest = lane.waiting & (~lane.waiting + np.uint32(1))
-    again = _splits(lane, samples)
+    again = _splits(lane)
     starts = ~lane.path.alive & (again | (lane.waiting != 0))
     following = jax.lax.population_count(lowest - np.uint32(1)).astype(jnp.int32)
     sample = jnp.where(again, lane.sample, jnp.minimum(following, plan.samples - 1))
@@ -469,12 +472,11 @@ def _next_sample(lane: Lane, plan: Plan, view: View, samples: FilmSamples, hits:
     )
     if lane.wave is not None:
         assert lane.way is not None
-        last = lane.wave + 1 == samples.indices.shape[1]
-        turns = again & last  # only what has gone through glass goes on after its last wavelength
+        turns = again & (lane.wave + 1 == samples.indices.shape[1])
         at_glass = surface < plan.balls
-        first, fresh_way = jnp.where(at_glass, 1, 0), jnp.where(at_glass, THROUGH, NO_GLASS)
+        first, way = jnp.where(at_glass, FIRST_THROUGH, 0), jnp.where(at_glass, THROUGH, NO_GLASS)
         new = new._replace(
-            wave=jnp.where(again, jnp.where(last, 0, lane.wave + 1), first),
-            way=jnp.where(again, jnp.where(turns, REFLECTED, lane.way), fresh_way),
+            wave=jnp.where(again, jnp.where(turns, 0, lane.wave + 1), first),
+            way=jnp.where(again, jnp.where(turns, REFLECTED, lane.way), way),
         )
     return choose(starts, new, lane)
