@@ -43,6 +43,7 @@ class Bench(NamedTuple):
             split=None,
             cutoff=jnp.zeros(()),
             one=None,
+            differentiable=True,
         )
         return bounce(path, setting, inside)
 

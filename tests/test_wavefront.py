@@ -42,11 +42,13 @@ def runs(draw, scene, film, seeds, **options):
 
 
 def scores(one, other):
-    """z scores of the blocks in which there is any noise."""
+    """z scores of the blocks in which there is more noise than rounding."""
     (mean, error), (other_mean, other_error) = one, other
-    noisy = (error > 0) & (other_error > 0)
+    noisy = (error > 1e-6) & (other_error > 1e-6)
     assert noisy.mean() > 0.5
-    return ((mean - other_mean) / np.hypot(error, other_error))[noisy]
+    z = (mean - other_mean)[noisy] / np.hypot(error, other_error)[noisy]
+    print(f"{z.size} z scores: mean {z.mean():.3f}, std {z.std():.3f}")
+    return z
 
 
 # --- what must not matter
@@ -84,14 +86,17 @@ def test_the_background_alone_is_drawn_without_paths():
     )
 
 
-@pytest.mark.parametrize("look_from", [(0.2, 0.3, 6.0), (0.0, 0.0, 0.1), (-3.0, 2.0, -1.0)])
-def test_no_sphere_is_missed_by_a_tile(look_from):
+@pytest.mark.parametrize(
+    ("look_from", "look_at"),
+    [((0.2, 0.3, 6.0), (0, 0, 0)), ((0, 0, 0.1), (0.1, -0.2, -1)), ((-3, 2, -1), (0, 0, 0))],
+)
+def test_no_sphere_is_missed_by_a_tile(look_from, look_at):
     # Many little spheres, wide view: a sphere that a tile leaves out would show the background.
     rng = np.random.default_rng(3)
     places = rng.uniform(-2, 2, (19, 3))
     radii = 10 ** rng.uniform(-1.5, -0.3, 19)
     spheres = [matte(0.0, tuple(p), float(r)) for p, r in zip(places, radii, strict=True)]
-    look_at, film = np.add(look_from, (0.1, -0.2, -1.0)), Film(72, 72)
+    film = Film(72, 72)
     scene = Scene(Camera(look_from, look_at, vertical_fov=120.0), spheres, Background(WHITE))
     picture = render(scene, film, samples=4, depth=2, dtype="float32")[..., 0]
     forward = np.subtract(look_at, look_from)
@@ -161,7 +166,7 @@ def test_the_room_is_mitsubas():
     options = {"samples": 64, "depth": depth, "dtype": "float32"}
     mean, error = runs(render, ROOM, film, range(16), **options)
     still = (error == 0) & (reference[1] == 0)
-    np.testing.assert_allclose(mean[still], reference[0][still], rtol=0, atol=1e-6)  # float32
+    np.testing.assert_allclose(mean[still], reference[0][still], rtol=3e-6)  # float32
     z = scores((mean, error), reference)
     assert abs(z.mean()) < 0.1
     assert 0.9 < z.std() < 1.1
@@ -219,7 +224,7 @@ def lab(rgb):
 
 def bands_against_colour(scene, film, samples):
     """Mean ΔE 2000 between 41 bands turned to colour, and the colour film."""
-    wavelengths = band_middles(380, 780, 41)
+    wavelengths = band_middles(380.0, 780.0, 41)
     options = {"samples": samples, "depth": 50, "dtype": "float32"}
     banded = Film(film.width, film.height, wavelengths)
     spectral = bands_to_rgb(np.asarray(render(scene, banded, **options), float), wavelengths)
@@ -287,5 +292,7 @@ def test_no_picture_on_the_way_is_biased(scene):
     first, *_, last = np.moveaxis(np.array(seeds, float), 1, 0)
     difference = first - last
     error = difference.std(axis=0, ddof=1) / 4
-    assert np.all(np.abs(difference.mean(axis=0)) < 4 * error + 1e-7)
+    # The parts of each pixel that a pass takes lie about its middle to a hundredth or two; so much
+    # of a pixel further the mean of the picture is another by 1e-4 or so.
+    assert np.all(np.abs(difference.mean(axis=0)) < 4 * error + 2e-4)
     assert np.all(error < 1e-3)

@@ -259,9 +259,11 @@ def nearest(ray: Ray, world: World, plan: Plan, last: Array, spheres: Candidates
 
         carried = jax.lax.fori_loop(0, spheres.groups, turn, ((best, group), none))
         best, group = nearer(jnp.asarray(spheres.groups, jnp.int32) - 1, carried[1], carried[0])
-    place = group * spheres.group + (best & rows).astype(jnp.int32)
     distance = jax.lax.bitcast_convert_type(best & ~rows, ray.origin.x.dtype)
-    number = jnp.where(distance < jnp.inf, _pick(spheres.numbers, place), plan.background)
+    number: Array = jnp.full_like(last, plan.background)
+    if spheres.group:
+        place = group * spheres.group + (best & rows).astype(jnp.int32)
+        number = jnp.where(distance < jnp.inf, _pick(spheres.numbers, place), number)
     for row, plane in enumerate(surface_numbers(plan)[1]):
         point, normal = vec3_row(world.points, row), vec3_row(world.normals, row)
         to_plane = plane_distance(ray, point, normal)
@@ -583,6 +585,7 @@ class Setting(NamedTuple):
         split: how paths part at the first surface; None where they never do.
         cutoff: part of its light with which a path ends.
         one: as in `once`.
+        differentiable: whether the chance of a choice, which is detached, is made up for.
     """
 
     tables: Tables
@@ -594,6 +597,7 @@ class Setting(NamedTuple):
     split: Split | None
     cutoff: Real
     one: Array | None
+    differentiable: bool
 
 
 def bounce(path: Path, setting: Setting, inside: bool | None = None) -> Path:
@@ -797,6 +801,10 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
             mirrored: Array = draw(0) < jax.lax.stop_gradient(glass.reflectance)
             if setting.split is not None:
                 mirrored, shares = _parted(mirrored, glass, cos_i, leaves, setting.split)
+            elif setting.differentiable:
+                share = jnp.where(mirrored, glass.reflectance, 1.0 - glass.reflectance)
+                share = jnp.where(is_glass & (share > 0), share, 1.0)
+                shares = (share / jax.lax.stop_gradient(share),) * plan.channels
             bent = Mix(1.0 / glass.eta, cos_i / glass.eta - glass.cos_t, zero)
             through = choose(mirrored, Mix(zero + 1.0, 2.0 * cos_i, zero), bent)
             mix = choose(is_glass, through, mix)
@@ -959,7 +967,8 @@ def _aim(
     # Radiance · BRDF · cosine over both densities; the albedo is in the throughput.
     ahead = scattered.matte & (total > 0) & (cosine > 0)
     by_chance = jnp.maximum(cosine, 0.0) / np.pi
-    share = jnp.where(ahead, by_chance / (by_chance + jnp.where(ahead, density, 1.0)), 0.0)
+    both = jax.lax.stop_gradient(by_chance + jnp.where(ahead, density, 1.0))
+    share = jnp.where(ahead, by_chance / both, 0.0)
     return scattered._replace(
         density=chosen,
         lamp=lamp + plan.first_lamp,
@@ -1031,7 +1040,8 @@ def _chance_weight(surface: Array, scattered: Scattered, tables: Tables, plan: P
     total = jnp.where(scattered.lamp_total > 0, scattered.lamp_total, 1.0)
     aimed = _pick(_luminances(tables.paint, plan), lamp) / (2.0 * np.pi * total)
     both = scattered.density + aimed
-    return jnp.where(weighed, scattered.density / jnp.where(both > 0, both, 1.0), 1.0)
+    weight = jax.lax.stop_gradient(scattered.density / jnp.where(both > 0, both, 1.0))
+    return jnp.where(weighed, weight, 1.0)
 
 
 def once(stage: Callable[[], Any], one: Array | None) -> Any:
@@ -1205,6 +1215,7 @@ def _to_the_end(
             None,
             lanes.cutoff,
             lanes.one,
+            differentiable=True,
         )
         return bounce(path, setting, inside)
 

@@ -5,15 +5,16 @@ small picture. Here a program is found by what decides it: the source, the stati
 shapes of its arguments.
 """
 
+import functools
 import gc
 import hashlib
 import os
 import pickle
 import platform
+import secrets
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -70,7 +71,11 @@ def _loaded_or_compiled(
             return serialize_executable.deserialize_and_load(stored, *trees)
         except Exception:  # whatever is wrong with a kept program, there is another way to it
             file.unlink(missing_ok=True)
-    jitted = jax.jit(traced, static_argnums=tuple(range(len(static))), compiler_options=QUICK)
+    # JAX must not find it in its own cache: what comes from there cannot be kept once more. So
+    # each compilation has a name that no other has.
+    alone = functools.update_wrapper(functools.partial(traced), traced)
+    alone.__name__ = f"{traced.__name__}_{secrets.token_hex(8)}"
+    jitted = jax.jit(alone, static_argnums=tuple(range(len(static))), compiler_options=QUICK)
     with _no_collection():
         lowered = jitted.lower(*static, *arguments)
     compiled = lowered.compile()
@@ -114,7 +119,7 @@ def _file(described: str) -> Path | None:
     return Path(folder) / "diffdisp" / name
 
 
-@cache
+@functools.cache
 def _surroundings() -> str:
     """All else that decides a program: source, versions, processor and device."""
     source = hashlib.sha256()

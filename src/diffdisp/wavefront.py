@@ -443,6 +443,7 @@ def _advance(lane: Lane, plan: Plan, view: View, samples: FilmSamples, hits: Arr
         split,
         view.cutoff,
         view.one,
+        differentiable=False,
     )
     return lane._replace(path=bounce(lane.path, setting))
 
