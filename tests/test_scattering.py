@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers import WHITE, direct, furnace, ground, lamp, matte, metal
+from helpers import BK7, WHITE, ball, direct, furnace, ground, lamp, matte, metal
 
 from diffdisp import programs
 from diffdisp.camera import Camera
@@ -119,6 +119,15 @@ def test_a_depth_of_one_shows_scatterers_black():
         view = Camera((0, 0, 4), look_at, vertical_fov=10.0)
         picture = render(Scene(view, bodies, Background(WHITE)), FILM, samples=4, depth=1)
         np.testing.assert_array_equal(picture, expected)
+
+
+@pytest.mark.parametrize("loop", [render, direct])
+def test_what_meets_no_glass_counts_once_in_colour(loop):
+    # Dispersive glass hides behind the matte ball, whose front does not see it.
+    scene = furnace(matte(0.3), ball(BK7, (0, 0, -50)), vertical_fov=60.0)
+    picture = loop(scene, FILM, **ONE_BOUNCE)
+    np.testing.assert_allclose(picture[:, 0], 1, rtol=0, atol=1e-14)  # the weights' rounding
+    np.testing.assert_allclose(picture[3:5, 5:7], 0.3, rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("depth", [2, 6])

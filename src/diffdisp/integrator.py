@@ -1169,6 +1169,11 @@ def _radiance(plan: Plan, indices: tuple[Array, ...], lanes: Lanes, loop: Loop) 
     waves = Paint(0, 0, None, None)  # type: ignore[arg-type]
     every = jax.vmap(jax.vmap(jax.vmap(start, (0, 0, None)), (0, 0, None)), (None, None, waves))
     paths = every(lanes.x, lanes.y, lanes.paint)
+    if plan.scattering and lanes.weights is not None:
+        # What a sample sees before it meets glass counts once, at its first wavelength.
+        first = np.arange(lanes.weights.shape[0])[:, None, None] == 0
+        seen = tuple(jnp.where(first, channel, 0.0) for channel in paths.radiance)
+        paths = paths._replace(radiance=seen)
     met = jnp.any(paths.alive, axis=0)
     if plan.first_lamp:
         paths = _to_the_end(plan, indices, lanes, paths, waves, loop)

@@ -169,6 +169,8 @@ def visible_tiles(scene: Scene, film: Film, plan: Plan, edge: int, workers: int)
     rows = np.where(np.arange(len(spheres)) < counts[:, None], rows, len(spheres))
     rows = np.pad(rows, ((0, 0), (0, width - len(spheres))), constant_values=len(spheres))
     capacity = max(1, PIXELS // edge**2)
+    if len(some) <= workers * max(1, capacity // 16):  # a small picture is laid out in small arrays
+        capacity = max(1, capacity // 16)
     # Equal parts, a multiple of the workers', each with room for all lanes.
     parts = min(-(-len(some) // (capacity * workers)) * workers, len(some))
 
