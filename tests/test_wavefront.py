@@ -204,11 +204,12 @@ def test_a_white_furnace_of_glass_and_white_paint():
 
 
 @pytest.mark.parametrize("samples", [96, 1024])
-def test_a_white_furnace_is_white_from_the_first_picture_on(samples):
-    # Of all wavelengths that a pass takes the weights sum to 1 in each channel.
+def test_a_white_furnace_is_white_in_the_end(samples):
+    # The weights of all wavelengths sum to 1 in each channel; those of a pass nearly so.
     (scene,) = with_textures(Checker(WHITE, WHITE, 10.0))
-    first = next(render_progressively(scene, SMALL, **(SINGLE | {"samples": samples})))
-    np.testing.assert_allclose(first.radiance.mean(axis=(0, 1)), 1, rtol=0, atol=1e-3)  # noise
+    first, *_, last = render_progressively(scene, SMALL, **(SINGLE | {"samples": samples}))
+    np.testing.assert_allclose(first.radiance.mean(axis=(0, 1)), 1, rtol=0, atol=2e-2)
+    np.testing.assert_allclose(last.radiance.mean(axis=(0, 1)), 1, rtol=0, atol=1e-3)  # noise
 
 
 def test_without_structure_dispersion_is_not_seen():
