@@ -174,6 +174,29 @@ def test_no_point_of_a_sphere_ahead(origin, direction, on):
     assert not first(*start, np.zeros(3), 1.0, on)[1]
 
 
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("radius", [0.3, 1.0, 100.0])
+@pytest.mark.parametrize("on", [False, True])
+def test_no_ray_meets_the_point_that_it_leaves(on, radius, dtype):
+    # Rounded points of a sphere; whether it is known that they are, or not.
+    rng = np.random.default_rng(2)
+    center = rng.normal(size=3).astype(dtype)
+    up, aside = unit(rng.normal(size=(2, 500, 3)))
+    aside = unit(aside - up * (aside * up).sum(-1, keepdims=True))
+    cosine = rng.uniform(0.01, 1.0, (500, 1))
+    origins = (center + radius * up).astype(dtype)
+    with jax.enable_x64(dtype == "float64"):
+        for side in (1, -1):
+            directions = (aside * np.sqrt(1 - cosine**2) + side * up * cosine).astype(dtype)
+            sphere = center, np.asarray(radius, dtype)
+            found, meets = first(origins, directions, *sphere, on)
+            assert meets.all() == (side < 0)
+            assert meets.any() == (side < 0)
+    # A chord: some ten roundings of terms of the second degree, over r cos.
+    error = np.abs(found - 2 * radius * cosine[:, 0]) * cosine[:, 0]
+    assert error.max() < 10 * (radius + np.abs(center).max()) * np.finfo(dtype).eps
+
+
 @pytest.mark.parametrize("scale", [0.3, 0.99, 2.0, 30.0])
 def test_first_point_is_the_least_positive_root(scale):
     origins = scale * unit(RNG.normal(size=(500, 3)))

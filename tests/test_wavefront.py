@@ -91,34 +91,33 @@ def test_the_background_alone_is_drawn_without_paths():
     [((0.2, 0.3, 6.0), (0, 0, 0)), ((0, 0, 0.1), (0.1, -0.2, -1)), ((-3, 2, -1), (0, 0, 0))],
 )
 def test_no_sphere_is_missed_by_a_tile(look_from, look_at):
-    # Many little spheres, wide view: a sphere that a tile leaves out would show the background.
+    # Black spheres large and little: one that a tile leaves out would show what is behind it.
     rng = np.random.default_rng(3)
     places = rng.uniform(-2, 2, (19, 3))
-    radii = 10 ** rng.uniform(-1.5, -0.3, 19)
+    radii = 10 ** rng.uniform(-1.5, 0.0, 19)
     spheres = [matte(0.0, tuple(p), float(r)) for p, r in zip(places, radii, strict=True)]
-    film = Film(72, 72)
-    scene = Scene(Camera(look_from, look_at, vertical_fov=120.0), spheres, Background(WHITE))
-    picture = render(scene, film, samples=4, depth=2, dtype="float32")[..., 0]
+    film = Film(144, 144)
+    scene = Scene(Camera(look_from, look_at, vertical_fov=70.0), spheres, Background(WHITE))
+    picture = render(scene, film, samples=16, depth=2, dtype="float32")[..., 0]
     forward = np.subtract(look_at, look_from)
     forward = forward / np.linalg.norm(forward)
     right = np.cross(forward, (0, 1, 0))
     right /= np.linalg.norm(right)
     above = np.cross(right, forward)
-    step = (np.arange(72) + 0.5 - 36) * 2 * np.tan(np.radians(60)) / 72
+    step = (np.arange(144) + 0.5 - 72) * 2 * np.tan(np.radians(35)) / 144
     rays = forward + right * step[:, None] - above * step[:, None, None]
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     offset = places - np.asarray(look_from)
     along = rays @ offset.T
     beside = (offset**2).sum(-1) - along**2
     within = (offset**2).sum(-1) < radii**2
-    met = within | ((along > 0) & (beside < radii**2))
-    pixel = 2 * np.tan(np.radians(60)) / 72 * np.maximum(along, 0)
+    pixel = 2 * np.tan(np.radians(35)) / 144 * np.maximum(along, 0)
     well = within | ((along > 0) & (np.sqrt(np.maximum(beside, 0)) < radii - pixel))
     np.testing.assert_array_equal(picture[well.any(-1)], 0)
     far = (np.sqrt(np.maximum(beside, 0)) > radii + 2 * pixel) & ~within
     far |= (along < -radii) & ~within
     np.testing.assert_array_equal(picture[far.all(-1)], 1)
-    assert met.any()
+    assert well.any()
 
 
 # --- the direct loop
@@ -205,10 +204,10 @@ def test_a_white_furnace_of_glass_and_white_paint():
 
 @pytest.mark.parametrize("samples", [96, 1024])
 def test_a_white_furnace_is_white_in_the_end(samples):
-    # The weights of all wavelengths sum to 1 in each channel; those of a pass nearly so.
+    # The weights of all wavelengths sum to 1 in each channel, and those of a pass too.
     (scene,) = with_textures(Checker(WHITE, WHITE, 10.0))
     first, *_, last = render_progressively(scene, SMALL, **(SINGLE | {"samples": samples}))
-    np.testing.assert_allclose(first.radiance.mean(axis=(0, 1)), 1, rtol=0, atol=2e-2)
+    np.testing.assert_allclose(first.radiance.mean(axis=(0, 1)), 1, rtol=0, atol=1e-3)  # noise
     np.testing.assert_allclose(last.radiance.mean(axis=(0, 1)), 1, rtol=0, atol=1e-3)  # noise
 
 
@@ -248,11 +247,13 @@ def bands_against_colour(scene, film, samples):
     return found
 
 
+@pytest.mark.slow
 def test_bands_turned_to_colour_are_the_colour_film():
     # Each bounce from paint multiplies three numbers here and spectra there.
     assert bands_against_colour(DISPERSION, Film(32, 24), 256) <= 2.0
 
 
+@pytest.mark.slow
 def test_of_one_coloured_surface_bands_are_nearly_exact():
     # A painted ball before a white sky, beside and behind glass.
     painted = Object(
@@ -291,7 +292,7 @@ def test_a_growing_picture_becomes_the_picture(scene):
 
 
 @pytest.mark.parametrize(
-    ("scene", "least"), [(ROOM, 2e-4), (DISPERSION, 1e-2)], ids=["room", "dispersion"]
+    ("scene", "least"), [(ROOM, 2e-4), (DISPERSION, 1e-3)], ids=["room", "dispersion"]
 )
 def test_no_picture_on_the_way_is_biased(scene, least):
     options = SINGLE | {"samples": 96}
@@ -306,7 +307,7 @@ def test_no_picture_on_the_way_is_biased(scene, least):
     difference = first - last
     error = difference.std(axis=0, ddof=1) / 4
     # The parts of each pixel that a pass takes lie about its middle to a hundredth or two; so much
-    # of a pixel further the mean of the picture is another by 1e-4 or so. Of dispersive glass a
-    # pass has some of the strata of the spectrum, whose weights alone do not sum to white.
+    # of a pixel further the mean of the picture is another by 1e-4 or so. And a pass shows fringes
+    # at fewer wavelengths than all of them do.
     assert np.all(np.abs(difference.mean(axis=0)) < 4 * error + least)
     assert np.all(error < 1e-3)

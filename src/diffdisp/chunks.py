@@ -290,6 +290,10 @@ def film_spectrum(film: Film, plan: Plan) -> Spectrum:
     )
 
 
+WAVES_OF_ANY_PATH = 2
+"""Wavelengths of a sample where light scatters: the middle one, and its own."""
+
+
 def with_split_paths(spectrum: Spectrum, plan: Plan) -> Spectrum:
     """The spectrum with the wavelengths of samples that the camera sees through glass."""
     if spectrum.weights is None:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from diffdisp.chunks import (
+    WAVES_OF_ANY_PATH,
     RunNumbers,
     Spectrum,
     all_pixels,
@@ -51,6 +52,9 @@ from diffdisp.wavefront import (
 
 PASS_PATHS = 1 << 24
 """Film samples of a pass over the picture, which a growing picture grows by: a second or a few."""
+
+ENOUGH_STRATA = 16
+"""Wavelengths of a pass of which every channel sees its part: fewer may leave one without any."""
 
 Progress = Callable[[int, int], None]
 
@@ -114,8 +118,7 @@ def render_progressively(
     """The pictures that `render` passes through, each of more samples; the last is its own.
 
     Each pass over the picture takes as many samples of every pixel as the others. A small picture
-    of few samples is done in one. What is seen through dispersive glass is white where it should
-    be once all samples are there; before, a channel may be a few percent off.
+    of few samples is done in one.
 
     Args:
         scene: as in `render`, without traced numbers.
@@ -216,7 +219,13 @@ def _of_pass(spectrum: Spectrum, cells: np.ndarray, passes: int) -> Spectrum:
     """The spectrum of the samples of one pass; what they count is over these alone."""
     if spectrum.weights is None:
         return spectrum
-    return Spectrum(spectrum.wavelengths[:, cells], None, spectrum.weights[:, cells] * passes)
+    weights = spectrum.weights[:, cells] * passes
+    through = weights[WAVES_OF_ANY_PATH:]
+    if passes > 1 and through.shape[0] * through.shape[1] >= ENOUGH_STRATA:
+        # What is seen through glass is white in each pass, not only in their sum.
+        whole = np.sum(through, axis=(0, 1), keepdims=True)
+        weights = np.concatenate([weights[:WAVES_OF_ANY_PATH], through / whole])
+    return Spectrum(spectrum.wavelengths[:, cells], None, weights)
 
 
 def _wavefront_pass(
