@@ -25,7 +25,7 @@ from diffdisp.dispersion import Sellmeier
 from diffdisp.film import Film
 from diffdisp.geometry import Plane, Sphere
 from diffdisp.material import Dielectric, Emitter
-from diffdisp.rendering import render
+from diffdisp.rendering import render, render_progressively
 from diffdisp.scene import Background, Object, Scene, with_glass
 
 BANDS = Film(12, 10, wavelengths=[0.45, 0.65])
@@ -63,6 +63,15 @@ def test_a_ball_of_index_one_is_gone(dtype, tolerance):
     # Nothing is reflected, so that three segments are all.
     picture = render(furnace(ball(AIR)), BANDS, samples=4, depth=3, dtype=dtype)
     np.testing.assert_allclose(picture, 1, rtol=0, atol=tolerance)  # rounding
+
+
+@pytest.mark.parametrize("samples", [32, 64, 96])
+def test_glass_alone_is_white_in_every_pass(samples):
+    # A pass takes 32 samples at most; light that a ball does not absorb is white at any number.
+    scene = furnace(ball(BK7))
+    for growing in render_progressively(scene, COLOR, samples=samples, depth=50, dtype="float64"):
+        mean = growing.radiance.mean(axis=(0, 1))
+        np.testing.assert_allclose(mean, 1, rtol=0, atol=5e-3)  # pixels partly on glass
 
 
 def test_a_ball_of_index_one_hides_nothing():

@@ -202,9 +202,9 @@ def _one_pass(
     work: _Work, film: Film, seed: int, number: int, progress: Progress
 ) -> Float[np.ndarray, "height width channels"]:
     """The mean of the samples of one pass over the picture."""
-    plan, cells = work.plan, work.cells[number:]
-    run = run_numbers(plan, seed, cells=np.roll(work.cells, -number, axis=0))
-    spectrum = _of_pass(work.spectrum, cells[0], len(work.cells))
+    plan, cells = work.plan, np.roll(work.cells, -number, axis=0)
+    run = run_numbers(plan, seed, cells=cells)
+    spectrum = _of_pass(work, cells[0])
     if work.tiles is not None:
         return _wavefront_pass(work, film, spectrum, run, progress)
     chunks, place = all_pixels(film, chunk_pixels(film, plan))
@@ -215,16 +215,19 @@ def _one_pass(
     return values.reshape(-1, film.channels)[place].reshape(film.height, film.width, film.channels)
 
 
-def _of_pass(spectrum: Spectrum, cells: np.ndarray, passes: int) -> Spectrum:
+def _of_pass(work: _Work, cells: np.ndarray) -> Spectrum:
     """The spectrum of the samples of one pass; what they count is over these alone."""
+    spectrum, passes = work.spectrum, len(work.cells)
     if spectrum.weights is None:
         return spectrum
     weights = spectrum.weights[:, cells] * passes
-    through = weights[WAVES_OF_ANY_PATH:]
+    # Where light scatters, the wavelengths of any path come first: these sum to 1 anyway.
+    first = WAVES_OF_ANY_PATH if work.plan.scattering else 0
+    through = weights[first:]
     if passes > 1 and through.shape[0] * through.shape[1] >= ENOUGH_STRATA:
         # What is seen through glass is white in each pass, not only in their sum.
         whole = np.sum(through, axis=(0, 1), keepdims=True)
-        weights = np.concatenate([weights[:WAVES_OF_ANY_PATH], through / whole])
+        weights = np.concatenate([weights[:first], through / whole])
     return Spectrum(spectrum.wavelengths[:, cells], None, weights)
 
 
@@ -342,7 +345,7 @@ def compile_ahead(scene: Scene, film: Film, *, samples: int, depth: int, dtype: 
     """
     work = _lay_out(scene, film, samples, depth, dtype)
     plan = work.plan
-    spectrum = _of_pass(work.spectrum, work.cells[0], len(work.cells))
+    spectrum = _of_pass(work, work.cells[0])
     run = run_numbers(plan, 0, cells=work.cells)
     if work.tiles is None:
         chunks, _ = all_pixels(film, chunk_pixels(film, plan))
