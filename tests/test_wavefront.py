@@ -12,7 +12,7 @@ from diffdisp import chunks, programs, rendering, wavefront
 from diffdisp.camera import Camera
 from diffdisp.color import bands_to_rgb
 from diffdisp.film import Film, band_middles
-from diffdisp.geometry import Sphere
+from diffdisp.geometry import Plane, Sphere
 from diffdisp.material import Lambertian
 from diffdisp.rendering import render, render_progressively
 from diffdisp.scene import Background, Object, Scene
@@ -118,6 +118,14 @@ def test_no_sphere_is_missed_by_a_tile(look_from, look_at):
     far |= (along < -radii) & ~within
     np.testing.assert_array_equal(picture[far.all(-1)], 1)
     assert well.any()
+
+
+def test_a_scene_of_planes_alone():
+    # A plane in a white surround: every path leaves it at once.
+    plane = Object(Plane([0, -1, 0], [0, 1, 0]), Lambertian([0.5, 0.25, 0.75]))
+    scene = Scene(Camera((0, 0, 3), (0, -1, 0)), (plane,), Background(WHITE))
+    picture = render(scene, Film(8, 6), samples=2, depth=5, dtype="float32")
+    np.testing.assert_allclose(picture[-1, 4], [0.5, 0.25, 0.75], rtol=1e-6)  # float32
 
 
 # --- the direct loop

@@ -294,7 +294,7 @@ def _first_hits(
             radii[rows],
             numbers[rows],
             tiles.groups[tile],
-            GROUP,
+            GROUP if plan.spheres else 0,
             True,
         )
 
