@@ -5,7 +5,7 @@ import pytest
 from helpers import N_D, numbers, reflectance
 from jax.test_util import check_grads
 
-from diffdisp.fresnel import cos_transmitted, fresnel_reflectance, reflect, refract
+from diffdisp.fresnel import cos_transmitted, fresnel_reflectance, reflection, refraction
 from diffdisp.glasses import named_glass
 from diffdisp.vector import vec3
 
@@ -20,6 +20,11 @@ def surface(cos_i, eta):
     """Reflectance and cosine of the refracted ray."""
     cos_t = cos_transmitted(cos_i, eta)
     return fresnel_reflectance(cos_i, cos_t, eta), cos_t
+
+
+def made_of(weights, direction, normal):
+    """A direction by its weights."""
+    return direction * weights[0] + normal * weights[1]
 
 
 def both(angles, eta):
@@ -95,13 +100,14 @@ def test_directions_obey_the_laws(angle, eta):
     direction = vec3(jnp.array([np.sin(angle), 0, -np.cos(angle)]))
     normal = vec3(jnp.array([0, 0, 1.0]))
     cos_i = jnp.cos(angle)
-    mirrored = numbers(reflect(direction, normal, cos_i))
+    mirrored = numbers(made_of(reflection(cos_i), direction, normal))
     np.testing.assert_allclose(mirrored, [np.sin(angle), 0, np.cos(angle)], rtol=0, atol=1e-15)
     cos_t = cos_transmitted(cos_i, jnp.asarray(eta))
     if cos_t == 0:
         assert np.sin(angle) / eta > 1
         return
-    bent = numbers(refract(direction, normal, cos_i, cos_t, jnp.asarray(eta)))
+    weights = refraction(cos_i, cos_t, jnp.asarray(eta))
+    bent = numbers(made_of(weights, direction, normal))
     sin_t = np.sin(angle) / eta
     np.testing.assert_allclose(bent, [sin_t, 0, -np.sqrt(1 - sin_t**2)], rtol=0, atol=1e-14)
 
@@ -114,8 +120,9 @@ def test_a_refracted_path_is_reversible(seed):
     n, eta, back = vec3(jnp.asarray(normal)), jnp.array(N_D), jnp.array(1 / N_D)
     cos_i = jnp.asarray(-direction @ normal)
     cos_t = cos_transmitted(cos_i, eta)
-    bent = refract(vec3(jnp.asarray(direction)), n, cos_i, cos_t, eta)
-    again = refract(-bent, -n, cos_t, cos_transmitted(cos_t, back), back)
+    bent = made_of(refraction(cos_i, cos_t, eta), vec3(jnp.asarray(direction)), n)
+    back_weights = refraction(cos_t, cos_transmitted(cos_t, back), back)
+    again = made_of(back_weights, -bent, -n)
     # Back from the denser side errors grow by n·cos_t / cos_i, below 50 for these seeds.
     np.testing.assert_allclose(numbers(again), -direction, rtol=0, atol=1e-13)
 

@@ -17,7 +17,7 @@ from diffdisp.dispersion import domain_error
 from diffdisp.film import Film
 from diffdisp.integrator import Lanes, Paint, lane_radiance, paint_table, world_tables
 from diffdisp.planning import Plan
-from diffdisp.programs import WIDE_VECTORS
+from diffdisp.programs import OPTIONS
 from diffdisp.sampling import Numbers, sample_grid
 from diffdisp.scene import Scene, is_glass, object_glass
 from diffdisp.vector import Array, Real
@@ -25,7 +25,7 @@ from diffdisp.vector import Array, Real
 COLOR_RANGE = (0.38, 0.78)
 """Wavelengths that a colour picture is made of, µm."""
 
-CHUNKS_PER_CALL = 16
+CHUNKS_PER_CALL = 4
 """Chunks that one call of the compiled program renders: what stopping and progress wait for."""
 
 
@@ -132,7 +132,7 @@ def check_glasses(scene: Scene, low: float, high: float) -> None:
 
 def chunk_pixels(film: Film, plan: Plan) -> int:
     """Pixels of a chunk: few enough that its paths stay in the cache, enough to fill a GPU."""
-    lanes = {"cpu": 16384 // np.dtype(plan.dtype).itemsize}.get(jax.default_backend(), 1 << 18)
+    lanes = {"cpu": 65536 // np.dtype(plan.dtype).itemsize}.get(jax.default_backend(), 1 << 18)
     waves = plan.wavelengths_per_sample if film.wavelengths is None else film.channels
     return int(np.clip(lanes // (plan.samples * (waves if plan.dispersive else 1)), 1, 1024))
 
@@ -451,4 +451,4 @@ def in_dtype(tree: Any, dtype: str) -> Any:
     return jax.tree.map(cast, tree)
 
 
-render_chunks_jit = jax.jit(render_chunks, static_argnums=0, compiler_options=WIDE_VECTORS)
+render_chunks_jit = jax.jit(render_chunks, static_argnums=0, compiler_options=OPTIONS)

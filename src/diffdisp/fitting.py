@@ -44,7 +44,7 @@ from diffdisp.glasses import glass_table
 from diffdisp.image import Picture
 from diffdisp.integrator import lane_radiance
 from diffdisp.planning import Plan, make_plan
-from diffdisp.programs import WIDE_VECTORS
+from diffdisp.programs import OPTIONS
 from diffdisp.scene import Scene, is_glass, object_glass, with_glass, without_names
 from diffdisp.vector import Array, Real
 
@@ -548,7 +548,7 @@ def _traced(
     return each_chunk(chunk, chunks)
 
 
-_traced_jit = jax.jit(_traced, static_argnums=(0, 1), compiler_options=WIDE_VECTORS)
+_traced_jit = jax.jit(_traced, static_argnums=(0, 1), compiler_options=OPTIONS)
 
 
 def _trace(
@@ -844,7 +844,7 @@ def _index_table(problem: Problem, level: Level) -> np.ndarray:
     return np.moveaxis(values.reshape(-1, len(INDEX_GRID), 3)[place], 1, 0)
 
 
-@partial(jax.jit, static_argnums=(0, 1), compiler_options=WIDE_VECTORS)
+@partial(jax.jit, static_argnums=(0, 1), compiler_options=OPTIONS)
 def _traced_at_indices(
     plan: Plan,
     ball: int,

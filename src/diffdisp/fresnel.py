@@ -2,18 +2,17 @@
 
 import jax.numpy as jnp
 
-from diffdisp.vector import Real, Vec3, least_square, safe_sqrt
+from diffdisp.vector import Real, least_square, safe_sqrt
 
 
-def reflect(direction: Vec3, normal: Vec3, cos_i: Real) -> Vec3:
-    """Mirror direction.
+def reflection(cos_i: Real) -> tuple[Real, Real]:
+    """What the mirror direction is made of: so much of the old one, and of the normal.
 
     Args:
-        direction: unit vector of the incoming ray.
-        normal: unit vector against it, so that `cos_i` = -direction·normal ≥ 0.
-        cos_i: cosine of the angle of incidence.
+        cos_i: cosine of the angle of incidence, ≥ 0; the normal is a unit vector on the side that
+            the ray comes from.
     """
-    return direction + normal * (2.0 * cos_i)
+    return jnp.ones_like(cos_i), 2.0 * cos_i
 
 
 def cos_transmitted(cos_i: Real, eta: Real) -> Real:
@@ -29,17 +28,15 @@ def cos_transmitted(cos_i: Real, eta: Real) -> Real:
     return safe_sqrt((eta - 1.0) * (eta + 1.0) + cos_i * cos_i, least_square(cos_i)) / eta
 
 
-def refract(direction: Vec3, normal: Vec3, cos_i: Real, cos_t: Real, eta: Real) -> Vec3:
-    """Refracted unit direction (Snell); meaningless under total internal reflection.
+def refraction(cos_i: Real, cos_t: Real, eta: Real) -> tuple[Real, Real]:
+    """The same of the refracted direction (Snell); meaningless under total internal reflection.
 
     Args:
-        direction: unit vector of the incoming ray.
-        normal: unit vector against it.
-        cos_i: cosine of the angle of incidence, ≥ 0.
+        cos_i: as in `reflection`.
         cos_t: `cos_transmitted(cos_i, eta)`.
         eta: index behind the surface over index before it.
     """
-    return direction * (1.0 / eta) + normal * (cos_i / eta - cos_t)
+    return 1.0 / eta, cos_i / eta - cos_t
 
 
 def fresnel_reflectance(cos_i: Real, cos_t: Real, eta: Real) -> Real:

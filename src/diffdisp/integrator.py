@@ -18,7 +18,7 @@ from jax.custom_derivatives import SymbolicZero, zero_from_primal
 from jaxtyping import Bool, Float, Int
 
 from diffdisp.camera import Camera, camera_ray
-from diffdisp.fresnel import cos_transmitted, fresnel_reflectance, reflect, refract
+from diffdisp.fresnel import cos_transmitted, fresnel_reflectance, reflection, refraction
 from diffdisp.geometry import (
     Plane,
     Ray,
@@ -286,15 +286,10 @@ def _over(step: Callable[[Any, Any], tuple[Any, None]], start: Any, rows: Any, c
     return jax.lax.scan(step, start, rows, unroll=min(count, 8))[0] if count else start
 
 
-def push_forward(
-    f: Callable[[Ray], tuple[Any, Any]], ray: Ray, footprint: tuple[Ray, Ray] | None
-) -> tuple[Any, Any, Any]:
-    """`f(ray)`, its derivatives along both edges of the footprint, and what else `f` found out."""
-    if footprint is None:
-        value, extra = f(ray)
-        return value, None, extra
-    value, push, extra = jax.linearize(f, ray, has_aux=True)
-    return value, (push(footprint[0]), push(footprint[1])), extra
+def pushed(of: Callable[[Any], Any], value: Any, edges: Any) -> tuple[Any, Any]:
+    """`of(value)`, and its derivatives along both edges of a footprint."""
+    result, push = jax.linearize(of, value)
+    return result, tuple(push(edge) for edge in edges)
 
 
 Channels = tuple[Real, ...]
@@ -307,6 +302,7 @@ def painted(
     tables: "Tables",
     plan: Plan,
     emits: bool,
+    one: Array | None,
 ) -> Channels:
     """What a surface, which is not glass, shows to a ray.
 
@@ -317,36 +313,41 @@ def painted(
         tables: the scene.
         plan: its static choices.
         emits: whether the surface ends paths, as all those do that are asked for here.
+        one: as in `once`.
     """
-    paint, first = tables.paint, plan.first_lamp - plan.balls
-    rows = slice(first, None) if emits else slice(0, first)
-    mean, half = ([c[rows] for c in channels] for channels in (paint.mean, paint.half))
-    row = jnp.clip(surface - (plan.first_lamp if emits else plan.balls), 0, mean[0].shape[0] - 1)
+    paint, mean, half = tables.paint, tables.paint.mean, tables.paint.half
+    first, end = 0, plan.first_lamp - plan.balls
+    if emits:
+        first, end = end, plan.background + 1 - plan.balls
+    row: Array | int = first
+    if end - first > 1:
+        row = jnp.clip(surface - plan.balls, first, end - 1)
+    place = row + tables.first_row
     tiled, cubed = (kinds[emits] for kinds in (plan.tiled, plan.cubed))
     if not (tiled or cubed):
-        return tuple(_pick(channel, row) for channel in mean)
-    scale = _pick(paint.scale[rows], row)
-    waves: list[Callable[[Ray], tuple[tuple[Real, ...], None]]] = []
+        return tuple(_pick(channel, place) for channel in mean)
+    scale = _pick(paint.scale, row)
+    waves: list[Callable[[Ray], tuple[Real, ...]]] = []
     if tiled:
         plane = _plane_row(surface, plan)
 
-        def on_tiles(ray: Ray) -> tuple[tuple[Real, ...], None]:
+        def on_tiles(ray: Ray) -> tuple[Real, ...]:
             offset = point(ray) - _pick_vector(tables.world.points, plane)
             u, v = (_pick_vector(axis, plane) for axis in tables.world.axes)
-            return (offset.dot(u) * scale, offset.dot(v) * scale), None
+            return offset.dot(u) * scale, offset.dot(v) * scale
 
         waves.append(on_tiles)
     if cubed:
-        waves.append(lambda ray: (tuple(point(ray) * scale), None))
-    is_cubes = _pick(paint.cubes[rows], row) if tiled and cubed else None
+        waves.append(lambda ray: tuple(point(ray) * scale))
+    is_cubes = _pick(paint.cubes, row) if tiled and cubed else None
     if path.footprint is None:
-        odd = _one_of([_is_odd(wave(path.ray)[0]) for wave in waves], is_cubes)
+        odd = _one_of([_is_odd(wave(path.ray)) for wave in waves], is_cubes)
         # Even and odd rows in one table: a look-up costs more than all else here.
-        place = row + jnp.where(odd, mean[0].shape[0], 0)
+        place = place + jnp.where(odd, mean[0].shape[0], 0)
         both = (jnp.concatenate([m + h, m - h]) for m, h in zip(mean, half, strict=True))
         return tuple(_pick(channel, place) for channel in both)
-    mix = _one_of([_filtered(wave, path) for wave in waves], is_cubes)
-    return tuple(_pick(m, row) + _pick(h, row) * mix for m, h in zip(mean, half, strict=True))
+    mix = once(lambda: _one_of([_filtered(wave, path) for wave in waves], is_cubes), one)
+    return tuple(_pick(m, place) + _pick(h, place) * mix for m, h in zip(mean, half, strict=True))
 
 
 def _one_of(found: list[Array], second: Array | None) -> Array:
@@ -360,9 +361,9 @@ def _is_odd(coordinates: tuple[Real, ...]) -> Array:
     return jnp.asarray(cells != 2.0 * jnp.floor(0.5 * cells))
 
 
-def _filtered(coordinates: Callable[[Ray], tuple[Any, None]], path: Path) -> Real:
+def _filtered(coordinates: Callable[[Ray], tuple[Real, ...]], path: Path) -> Real:
     """The mean over a footprint of +1 in even and -1 in odd tiles."""
-    values, edges, _ = push_forward(coordinates, path.ray, path.footprint)
+    values, edges = pushed(coordinates, path.ray, path.footprint)
     return reduce(jnp.multiply, map(filtered_square_wave, values, *edges))
 
 
@@ -374,7 +375,9 @@ def _beneath(point: Vec3, outward: Vec3, surface: Array, tables: "Tables", plan:
     return point - outward * (1e-3 / jnp.where(scale > 0, scale, 1.0))
 
 
-def emitted(surface: Array, path: Path, tables: "Tables", plan: Plan) -> Channels:
+def emitted(
+    surface: Array, path: Path, tables: "Tables", plan: Plan, one: Array | None
+) -> Channels:
     """Radiance of the surface that ends a path."""
     world = tables.world
     sphere = jnp.clip(surface - plan.first_lamp + plan.first_plane, 0, max(plan.spheres - 1, 0))
@@ -396,7 +399,7 @@ def emitted(surface: Array, path: Path, tables: "Tables", plan: Plan) -> Channel
             outward = choose(on_lamp, (found - center) * (1.0 / radius), outward)
         return _beneath(where, outward, surface, tables, plan)
 
-    return painted(surface, point, path, tables, plan, emits=True)
+    return painted(surface, point, path, tables, plan, True, one)
 
 
 def _plane_row(surface: Array, plan: Plan) -> Array:
@@ -417,10 +420,17 @@ def _on_plane(ray: Ray, plane: Array, valid: Array, world: World) -> Vec3:
 
 
 class Tables(NamedTuple):
-    """A scene as the tracer sees it."""
+    """A scene as the tracer sees it.
+
+    Args:
+        world: its geometry.
+        paint: what its surfaces show.
+        first_row: of the rows of `paint` for the path's wavelength, where each has its own.
+    """
 
     world: World
     paint: Paint
+    first_row: Array | int = 0
 
 
 def start_path(
@@ -431,6 +441,7 @@ def start_path(
     film_point: tuple[Real, Real],
     middle: tuple[Real, Real],
     cell: tuple[Real, Real],
+    one: Array | None,
 ) -> Path:
     """The path from a film point to its first surface; ended, unless that one sends it on.
 
@@ -442,6 +453,7 @@ def start_path(
         film_point: pixels to the right of and below the picture's upper left corner.
         middle: the picture's middle, in the same pixels.
         cell: width and height of the part of the film that the sample stands for, pixels.
+        one: as in `once`.
     """
 
     def through(x: Real, y: Real) -> Ray:
@@ -457,7 +469,7 @@ def start_path(
         ray, tables.world, plan, no_surface(zero), all_spheres(tables.world, plan, None)
     )
     path = new_path(ray, footprint, surface, plan)
-    shown = emitted(surface, path, tables, plan)
+    shown = emitted(surface, path, tables, plan, one)
     ends = surface >= plan.first_lamp
     return path._replace(radiance=tuple(jnp.where(ends, channel, 0.0) for channel in shown))
 
@@ -613,62 +625,110 @@ def bounce(path: Path, setting: Setting, inside: bool | None = None) -> Path:
     return _both_ways(path, setting, path.last == path.surface if inside is None else inside)
 
 
+class Way(NamedTuple):
+    """One of both continuations: its ray and footprint, and its share of the light."""
+
+    ray: Ray
+    footprint: tuple[Ray, Ray]
+    share: Real
+
+
 def _both_ways(path: Path, setting: Setting, inside: Array | bool) -> Path:
     """A bounce in a scene that sends paths on only from glass: two ways, chosen at the end."""
-    (world, _), plan, ball = setting.tables, setting.plan, path.surface
-    center, radius = _pick_vector(world.centers, ball), _pick(world.radii, ball)
+    plan, world, ball = setting.plan, setting.tables.world, path.surface
+    outer, inner, differ = _parting(path, setting, inside)
+    throughput, spheres = path.throughput[0], all_spheres(world, plan, setting.one)
 
-    def scatter(ray: Ray) -> tuple[tuple[Ray, Ray], tuple[Real, Array]]:
-        distance = _distance_to_ball(ray, center, radius, plan, inside)
-        outward = normalize(ray.origin + ray.direction * distance - center)
-        point = center + outward * radius
-        # A border within glass, or a camera there, shows its side only here.
-        leaves = ray.direction.dot(outward) > 0 if plan.nested else inside
-        facing = choose(leaves, -outward, outward)
-        cos_i = jnp.abs(ray.direction.dot(outward))
-        media = surface_indices(point, outward, ball, setting.index_of, world, plan)
-        glass = glass_interface(media, cos_i, leaves)
-        mirrored = reflect(ray.direction, facing, cos_i)
-        bent = refract(ray.direction, facing, cos_i, glass.cos_t, glass.eta)
-        outer = Ray(point, choose(leaves, bent, mirrored))
-        inner = Ray(point, choose(leaves, mirrored, bent))
-        outer_share = choose(leaves, 1.0 - glass.reflectance, glass.reflectance)
-        return (outer, inner), (outer_share, glass.differ)
-
-    (outer, inner), tangents, (outer_share, differ) = once(
-        lambda: push_forward(scatter, path.ray, path.footprint), setting.one
-    )
-    outer_print, inner_print = (tuple(t[i] for t in tangents) for i in (0, 1))
-    inner_share, throughput = 1.0 - outer_share, path.throughput[0]
-
-    spheres = all_spheres(world, plan, setting.one)
-
-    def arrive(ray: Ray, footprint: tuple[Ray, Ray], share: Real, radiance: Channels) -> Any:
-        """The surface that the ray meets, and the radiance with what that one adds."""
-        surface = nearest(ray, world, plan, ball, spheres)
-        light = emitted(surface, path._replace(ray=ray, footprint=footprint), setting.tables, plan)
-        factor = jnp.where(path.alive & (surface >= plan.first_lamp), throughput * share, 0.0)
+    def arrive(way: Way, radiance: Channels) -> tuple[Array, Channels]:
+        """The surface that a way meets, and the radiance with what that one adds."""
+        surface = nearest(way.ray, world, plan, ball, spheres)
+        arriving = path._replace(ray=way.ray, footprint=way.footprint)
+        light = emitted(surface, arriving, setting.tables, plan, setting.one)
+        factor = jnp.where(path.alive & (surface >= plan.first_lamp), throughput * way.share, 0.0)
         return surface, tuple(r + factor * x for r, x in zip(radiance, light, strict=True))
 
-    outer_surface, radiance = arrive(outer, outer_print, outer_share, path.radiance)
-    outer_goes = (outer_surface < plan.first_lamp) & (outer_share > 0)
-    inner_goes, inner_surface = inner_share > 0, ball
+    outer_surface, radiance = arrive(outer, path.radiance)
+    outer_goes = (outer_surface < plan.first_lamp) & (outer.share > 0)
+    inner_goes, inner_surface = inner.share > 0, ball
     if plan.nested:
-        inner_surface, radiance = arrive(inner, inner_print, inner_share, radiance)
+        inner_surface, radiance = arrive(inner, radiance)
         inner_goes = inner_goes & (inner_surface < plan.first_lamp)
 
-    way = (inner_share, inner_goes, inner_surface, inner, inner_print)
+    way, goes_on, surface = inner, inner_goes, inner_surface
     if plan.random:  # with one ball, whatever leaves it never comes back
-        chance = jnp.where(inner_goes, jax.lax.stop_gradient(outer_share), 1.0)
+        chance = jnp.where(inner_goes, jax.lax.stop_gradient(outer.share), 1.0)
         chance = jnp.where(outer_goes, chance, 0.0)
         go_out = setting.draw(path.bounces, 0) < chance
-        way = choose(go_out, (outer_share, outer_goes, outer_surface, outer, outer_print), way)
-        way = (way[0] / jnp.where(go_out, chance, 1.0 - chance), *way[1:])
-    share, goes_on, surface, ray, footprint = way
+        way, goes_on, surface = choose(
+            go_out, (outer, outer_goes, outer_surface), (inner, inner_goes, inner_surface)
+        )
+        way = way._replace(share=way.share / jnp.where(go_out, chance, 1.0 - chance))
     moved = path._replace(
-        ray=ray, footprint=footprint, surface=surface, last=ball, throughput=(throughput * share,)
+        ray=way.ray,
+        footprint=way.footprint,
+        surface=surface,
+        last=ball,
+        throughput=(throughput * way.share,),
     )
     return _go_on(path, moved, goes_on, differ, radiance, setting)
+
+
+def _parting(path: Path, setting: Setting, inside: Array | bool) -> tuple[Way, Way, Array]:
+    """The outer and the inner way from a glass surface, and whether it is an interface.
+
+    In stages, each computed once: in one, the fusing compiler would compute the whole again for
+    each of the footprint's numbers.
+    """
+    plan, world, ball = setting.plan, setting.tables.world, path.surface
+    center, radius = _pick_vector(world.centers, ball), _pick(world.radii, ball)
+    assert path.footprint is not None
+
+    def stage(of: Callable[[Any], Any], value: Any, *edges: Any) -> tuple[Any, Any]:
+        return once(lambda: pushed(of, value, edges), setting.one)
+
+    def normal(ray: Ray) -> Vec3:
+        distance = _distance_to_ball(ray, center, radius, plan, inside)
+        return normalize(ray.origin + ray.direction * distance - center)
+
+    old, changes = path.ray.direction, tuple(edge.direction for edge in path.footprint)
+    outward, turns = stage(normal, path.ray, *path.footprint)
+    point = center + outward * radius
+    both_turn = tuple(zip(changes, turns, strict=True))
+    cosine, tilts = stage(lambda vectors: vectors[0].dot(vectors[1]), (old, outward), *both_turn)
+    # A border within glass, or a camera there, shows its side only here.
+    leaves = cosine > 0 if plan.nested else inside
+    media = surface_indices(point, outward, ball, setting.index_of, world, plan)
+
+    def weights(cosine: Real) -> tuple[Real, ...]:
+        """Of the outward normal in the mirrored direction, and in the bent one."""
+        cos_i = jnp.abs(cosine)
+        glass = glass_interface(media, cos_i, leaves)
+        against = reflection(cos_i)[1], refraction(cos_i, glass.cos_t, glass.eta)[1]
+        return tuple(choose(leaves, -weight, weight) for weight in against)
+
+    def light() -> tuple[Real, Real, Array]:
+        """The outer way's share, the old direction's weight in the bent one, if they differ."""
+        glass = glass_interface(media, jnp.abs(cosine), leaves)
+        share = choose(leaves, 1.0 - glass.reflectance, glass.reflectance)
+        return share, 1.0 / glass.eta, glass.differ
+
+    both_weights, weighed = stage(weights, cosine, *tilts)
+    share, slower, differ = once(light, setting.one)
+
+    def directions(given: tuple[Vec3, Vec3, tuple[Real, ...]]) -> tuple[Vec3, Vec3]:
+        old, outward, (mirror, bend) = given
+        mirrored, bent = old + outward * mirror, old * slower + outward * bend
+        return choose(leaves, bent, mirrored), choose(leaves, mirrored, bent)
+
+    given, moves = (old, outward, both_weights), zip(changes, turns, weighed, strict=True)
+    (outer, inner), (across, down) = stage(directions, given, *moves)
+    at = tuple(turn * radius for turn in turns)
+
+    def way(direction: Vec3, number: int, share: Real) -> Way:
+        footprint = Ray(at[0], across[number]), Ray(at[1], down[number])
+        return Way(Ray(point, direction), footprint, share)
+
+    return way(outer, 0, share), way(inner, 1, 1.0 - share), differ
 
 
 def _go_on(
@@ -746,7 +806,7 @@ def _one_way(path: Path, setting: Setting) -> Path:
         radiance = tuple(r + x for r, x in zip(radiance, shown, strict=True))
     spheres = all_spheres(tables.world, plan, setting.one)
     surface = nearest(moved.ray, tables.world, plan, path.surface, spheres)
-    light = emitted(surface, moved, tables, plan)
+    light = emitted(surface, moved, tables, plan, setting.one)
     arrives = counts & scattered.goes_on & (surface >= plan.first_lamp)
     factor = jnp.where(arrives, 1.0, 0.0)
     if plan.lit:
@@ -763,7 +823,7 @@ def _one_way(path: Path, setting: Setting) -> Path:
 
 def _scatter(path: Path, setting: Setting) -> Scattered:
     """What the surface that a path meets does to it."""
-    (world, _), plan, surface = setting.tables, setting.plan, path.surface
+    (world, *_), plan, surface = setting.tables, setting.plan, path.surface
     old = path.ray.direction
     first_matte, after_matte = plan.mattes
     is_matte = (surface >= first_matte) & (surface < after_matte)
@@ -785,7 +845,7 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
     def ways() -> tuple[Mix, Vec3 | None, Array, Channels | None]:
         """How the new direction is mixed, of what, whether there is a surface, what goes there."""
         unit, shares, zero = None, None, jnp.zeros_like(cosine)
-        mix, differ = Mix(zero + 1.0, 2.0 * cos_i, zero), jnp.ones(cosine.shape, bool)
+        mix, differ = Mix(*reflection(cos_i), zero), jnp.ones(cosine.shape, bool)
         if plan.numbers_per_bounce > 1:
             unit = uniform_direction(draw(0), draw(1))
         if plan.fuzzy:
@@ -805,8 +865,8 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
                 share = jnp.where(mirrored, glass.reflectance, 1.0 - glass.reflectance)
                 share = jnp.where(is_glass & (share > 0), share, 1.0)
                 shares = (share / jax.lax.stop_gradient(share),) * plan.channels
-            bent = Mix(1.0 / glass.eta, cos_i / glass.eta - glass.cos_t, zero)
-            through = choose(mirrored, Mix(zero + 1.0, 2.0 * cos_i, zero), bent)
+            bent = Mix(*refraction(cos_i, glass.cos_t, glass.eta), zero)
+            through = choose(mirrored, Mix(*reflection(cos_i), zero), bent)
             mix = choose(is_glass, through, mix)
             differ = jnp.asarray(glass.differ | ~is_glass)
         return mix, unit, differ, shares
@@ -830,7 +890,7 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
         if plan.fuzzy:
             goes_on = is_matte | is_glass | (direction.dot(facing) > 0)
         sunk = _beneath(point, outward, surface, setting.tables, plan)
-        albedo = painted(surface, lambda _: sunk, path, setting.tables, plan, emits=False)
+        albedo = painted(surface, lambda _: sunk, path, setting.tables, plan, False, setting.one)
         throughput = tuple(
             t * jnp.where(is_glass, 1.0, a) for t, a in zip(path.throughput, albedo, strict=True)
         )
@@ -888,7 +948,7 @@ def _meet(path: Path, setting: Setting) -> tuple[Vec3, Vec3, Real]:
 
     The normal of a sphere is the outward one.
     """
-    (world, _), plan, ray, surface = setting.tables, setting.plan, path.ray, path.surface
+    (world, *_), plan, ray, surface = setting.tables, setting.plan, path.ray, path.surface
     rows = plan.first_plane
     if rows:
         row = jnp.minimum(surface, rows - 1)
@@ -922,7 +982,7 @@ def _aim(
     A lamp is chosen by its luminance times its solid angle, and a direction uniformly in the
     cone of its sphere. The density of a direction to a lamp is then its luminance over the sum.
     """
-    (world, paint), plan, point = setting.tables, setting.plan, scattered.ray.origin
+    (world, paint, _), plan, point = setting.tables, setting.plan, scattered.ray.origin
     zero = jnp.zeros_like(point.x)
 
     def weigh(best: Any, lamp: tuple[Vec3, Real, Real, Array]) -> tuple[Any, None]:
@@ -1021,7 +1081,7 @@ def _lamplight(path: Path, counts: Array, scattered: Scattered, setting: Setting
     ray, spheres = scattered.to_lamp, all_spheres(tables.world, plan, setting.one)
     surface = nearest(ray, tables.world, plan, path.surface, spheres)
     assert scattered.lamp is not None
-    light = emitted(scattered.lamp, to_lamp, tables, plan)
+    light = emitted(scattered.lamp, to_lamp, tables, plan, setting.one)
     factor = jnp.where(counts & (surface == scattered.lamp), scattered.lamp_share, 0.0)
     return tuple(t * factor * x for t, x in zip(scattered.throughput, light, strict=True))
 
@@ -1063,8 +1123,15 @@ def once(stage: Callable[[], Any], one: Array | None) -> Any:
     structure = jax.tree.structure(shape)
     empty = [jnp.zeros(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(shape)]
 
-    def again(_: Array, old: list[Array]) -> list[Array]:
-        return jax.core.eval_jaxpr(traced.jaxpr, traced.consts)
+    def again(turn: Array, old: list[Array]) -> list[Array]:
+        # What does not depend on the turn would be moved out of the loop, and be fused there.
+        first = turn < one
+
+        def of_turn(value: Any) -> Any:
+            number = isinstance(value, jax.core.Tracer) and value.ndim == 0
+            return jnp.where(first, value, jnp.zeros_like(value)) if number else value
+
+        return jax.core.eval_jaxpr(traced.jaxpr, [of_turn(value) for value in traced.consts])
 
     return jax.tree.unflatten(structure, jax.lax.fori_loop(jnp.zeros_like(one), one, again, empty))
 
@@ -1155,29 +1222,37 @@ def _instantiate(tangent: object, primal: Array) -> object:
     return zero_from_primal(primal) if _zero(tangent) else tangent  # type: ignore[no-untyped-call]
 
 
-Loop = Callable[[Callable[[Path], Path], Path, Plan], Path]
+Step = Callable[[Array, Path], Path]
+"""From the numbers of some lanes, and their paths, to the paths advanced by one surface."""
+
+Loop = Callable[[Step | None, Step, Path, Plan], Path]
+"""Follows paths to their ends; by the first step once, where there is one, then by the other."""
 
 
 def _radiance(plan: Plan, indices: tuple[Array, ...], lanes: Lanes, loop: Loop) -> Array:
     """`lane_radiance`, with the loop that the wanted derivative allows."""
     middle, cell = lanes.middle, lanes.cell
+    waves, rows = lanes.paint.mean[0].shape
+    # The rows of all wavelengths in one table.
+    mean, half = (tuple(c.reshape(-1) for c in part) for part in lanes.paint[:2])
+    tables = Tables(lanes.world, lanes.paint._replace(mean=mean, half=half))
+    first_rows = np.arange(waves, dtype=np.int32) * np.int32(rows)
 
-    def start(x: Real, y: Real, paint: Paint) -> Path:
-        tables = Tables(lanes.world, paint)
-        return start_path(lanes.camera, tables, plan, lanes.height, (x, y), middle, cell)
+    def start(x: Real, y: Real, first_row: Array) -> Path:
+        seen = tables._replace(first_row=first_row)
+        return start_path(lanes.camera, seen, plan, lanes.height, (x, y), middle, cell, lanes.one)
 
-    waves = Paint(0, 0, None, None)  # type: ignore[arg-type]
-    every = jax.vmap(jax.vmap(jax.vmap(start, (0, 0, None)), (0, 0, None)), (None, None, waves))
-    paths = every(lanes.x, lanes.y, lanes.paint)
+    every = jax.vmap(jax.vmap(jax.vmap(start, (0, 0, None)), (0, 0, None)), (None, None, 0))
+    paths = every(lanes.x, lanes.y, first_rows)
     if plan.scattering and lanes.weights is not None:
         # What a sample sees before it meets glass counts once, at its first wavelength.
         first = np.arange(lanes.weights.shape[0])[:, None, None] == 0
         seen = tuple(jnp.where(first, channel, 0.0) for channel in paths.radiance)
         paths = paths._replace(radiance=seen)
     met = jnp.any(paths.alive, axis=0)
+    radiance: Array = jnp.stack(paths.radiance, axis=-1)
     if plan.first_lamp:
-        paths = _to_the_end(plan, indices, lanes, paths, waves, loop)
-    radiance = jnp.stack(paths.radiance, axis=-1)
+        radiance = _to_the_end(plan, indices, lanes, tables, paths, loop)
     if lanes.weights is None:
         return jnp.mean(radiance, axis=1, keepdims=True)
     alike = 1.0 / (lanes.weights.shape[0] * lanes.weights.shape[1])
@@ -1188,34 +1263,42 @@ def _radiance(plan: Plan, indices: tuple[Array, ...], lanes: Lanes, loop: Loop) 
 
 
 def _to_the_end(
-    plan: Plan, indices: tuple[Array, ...], lanes: Lanes, paths: Path, waves: Paint, loop: Loop
-) -> Path:
-    """The paths followed to their ends."""
+    plan: Plan,
+    indices: tuple[Array, ...],
+    lanes: Lanes,
+    tables: Tables,
+    paths: Path,
+    loop: Loop,
+) -> Float[Array, "wavelengths samples pixels channels"]:
+    """The radiance of the paths (J, S, P), followed to their ends."""
     numbers = Numbers(plan.numbers_per_bounce, lanes.seed, plan.dtype)
-    copies = paths.alive.shape[0]
-    wave = np.arange(copies, dtype=np.uint32)
+    waves, samples, pixels = paths.alive.shape
+    rows = tables.paint.mean[0].shape[0] // waves
     index = jnp.stack(indices, axis=-1) if indices else None
-    by_sample = 0 if index is not None and index.ndim == 3 else None
     weights = None
     if lanes.weights is not None:
-        weights = tuple(jnp.moveaxis(lanes.weights * lanes.weights.shape[1], -1, 0))
+        weights = tuple(jnp.moveaxis(lanes.weights * samples, -1, 0))
 
-    def advance(
-        path: Path,
-        pixel: Array,
-        sample: Array,
-        wave: Array,
-        index: Array | None,
-        weights: Channels | None,
-        paint: Paint,
-        inside: bool | None,
-    ) -> Path:
+    def advance(lane: Array, path: Path, inside: bool | None) -> Path:
+        wave, sample, pixel = lane // (samples * pixels), lane // pixels % samples, lane % pixels
+
+        def draw(bounces: Array, decision: int) -> Real:
+            words = look_up(lanes.pixel, pixel), look_up(lanes.sample, sample)
+            return numbers.of_bounce(*words, bounces, decision)
+
+        def index_of(ball: Array | int) -> Real:
+            assert index is not None
+            return look_up(index, *(wave, sample)[: index.ndim - 1], ball)
+
+        counts = None
+        if weights is not None and plan.scattering:
+            counts = tuple(look_up(channel, wave, sample) for channel in weights)
         setting = Setting(
-            Tables(lanes.world, paint),
+            tables._replace(first_row=wave * rows),
             plan,
-            partial(numbers.of_bounce, pixel, sample),
-            lambda ball: _pick(index, ball),  # type: ignore[arg-type]
-            weights if plan.scattering else None,
+            draw,
+            index_of,
+            counts,
             None if weights is None else wave == 0,
             None,
             lanes.cutoff,
@@ -1224,35 +1307,105 @@ def _to_the_end(
         )
         return bounce(path, setting, inside)
 
-    def every_path(inside: bool | None) -> Callable[[Path], Path]:
-        step = partial(advance, inside=inside)
-        pixels = jax.vmap(step, (0, 0, None, None, None, None, None))
-        samples = jax.vmap(pixels, (0, None, 0, None, by_sample, 0, None))
-        every = jax.vmap(samples, (0, None, None, 0, 0, 0, waves))
-        return lambda paths: every(
-            paths, lanes.pixel, lanes.sample, wave, index, weights, lanes.paint
+    def every_path(inside: bool | None) -> Step:
+        return jax.vmap(partial(advance, inside=inside))
+
+    flat = jax.tree.map(lambda leaf: leaf.reshape(-1), paths)
+    if plan.scattering or plan.balls > 1 or plan.nested:
+        ended = loop(None, every_path(None), flat, plan)
+    else:
+        # One ball apart from all else is entered once; after that its paths stay inside.
+        ended = loop(every_path(False), every_path(True), flat, plan)
+    return jnp.stack(ended.radiance, axis=-1).reshape(waves, samples, pixels, -1)
+
+
+BLOCK = 1024
+"""Paths of a chunk that advance together on a processor core."""
+
+
+def _until_done(enter: Step | None, advance: Step, paths: Path, plan: Plan) -> Path:
+    """All paths to their ends; no derivative in reverse mode.
+
+    Some paths meet one surface and others fifty. They are followed in blocks, and where enough of
+    a block have ended the others move up.
+    """
+    total = paths.alive.shape[0]
+    block = min(BLOCK, total) if jax.default_backend() == "cpu" else total
+    spare = -total % block
+
+    def padded(leaf: Array) -> Array:
+        return jnp.pad(leaf, (0, spare), mode="edge")
+
+    def sweep(step: Callable[[Array, Path, Array], Path], state: Any) -> Any:
+        """All blocks by one step each; what still goes on moves to the front."""
+        count = state[1]
+
+        def of_block(number: Array, carried: Any) -> Any:
+            lanes, kept, results = carried
+            start = number * block
+            lane, path = jax.tree.map(
+                lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, start, block), lanes
+            )
+            there = start + np.arange(block, dtype=np.int32) < count
+            lane = jnp.where(there, lane, total)
+            path = path._replace(alive=path.alive & there)
+            path = step(lane, path, count)
+            pairs = zip(results, path.radiance, strict=True)
+            results = tuple(whole.at[lane].set(part) for whole, part in pairs)
+            place = jnp.where(path.alive, jnp.cumsum(path.alive, dtype=jnp.int32) - 1, block)
+            order = (
+                jnp.zeros(block, jnp.int32)
+                .at[place]
+                .set(np.arange(block, dtype=np.int32), mode="drop")
+            )
+            lanes = jax.tree.map(
+                lambda whole, part: jax.lax.dynamic_update_slice_in_dim(
+                    whole, look_up(part, order), kept, 0
+                ),
+                lanes,
+                (lane, path),
+            )
+            return lanes, kept + jnp.sum(path.alive, dtype=jnp.int32), results
+
+        blocks = (count + (block - 1)) // block
+        none = jnp.zeros((), jnp.int32)
+        return jax.lax.fori_loop(0, blocks, of_block, (state[0], none, state[2]))
+
+    def once_in(lane: Array, path: Path, _: Array) -> Path:
+        assert enter is not None
+        return _unless_done(partial(enter, lane), path)
+
+    def thinned(lane: Array, path: Path, count: Array) -> Path:
+        going = jnp.sum(path.alive, dtype=jnp.int32)
+        # Until half of them have ended; the last block has none to fill it.
+        least = jnp.where(count <= block, 0, going // 2)
+        return jax.lax.while_loop(
+            lambda path: jnp.sum(path.alive, dtype=jnp.int32) > least,
+            partial(advance, lane),
+            path,
         )
 
-    if plan.scattering or plan.balls > 1 or plan.nested:
-        return loop(every_path(None), paths, plan)
-    # One ball apart from all else is entered once; after that its paths stay inside.
-    paths = _unless_done(every_path(False), paths)
-    return loop(every_path(True), paths, plan)
+    paths = jax.tree.map(padded, paths)
+    numbers = jnp.arange(total + spare, dtype=jnp.int32)
+    results = tuple(jnp.zeros(total + 1, plan.dtype) for _ in range(plan.channels))
+    state = (numbers, paths), jnp.asarray(total, jnp.int32), results
+    if enter is not None:
+        state = sweep(once_in, state)
+    state = jax.lax.while_loop(lambda state: state[1] > 0, partial(sweep, thinned), state)
+    return paths._replace(radiance=tuple(channel[:total] for channel in state[2]))
 
 
-def _until_done(advance: Callable[[Path], Path], paths: Path, plan: Plan) -> Path:
-    """All paths to their ends; no derivative in reverse mode."""
-    return jax.lax.while_loop(lambda paths: jnp.any(paths.alive), advance, paths)
-
-
-def _bounded(advance: Callable[[Path], Path], paths: Path, plan: Plan) -> Path:
+def _bounded(enter: Step | None, advance: Step, paths: Path, plan: Plan) -> Path:
     """All paths to their ends in a fixed number of turns, idle ones skipped; any derivative."""
+    numbers = np.arange(paths.alive.shape[0], dtype=np.int32)
     # Borders between equal media count for no bounce; a chord meets two of each ball at most.
     turns = (plan.depth - 1) * (2 * plan.balls if plan.nested else 1)
 
     def turn(paths: Path, _: None) -> tuple[Path, None]:
-        return _unless_done(advance, paths), None
+        return _unless_done(partial(advance, numbers), paths), None
 
+    if enter is not None:
+        paths = _unless_done(partial(enter, numbers), paths)
     return jax.lax.scan(turn, paths, length=turns)[0]
 
 

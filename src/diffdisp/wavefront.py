@@ -302,7 +302,7 @@ def _first_hits(
             ray = once(lambda: _sample_ray(plan, view, samples, x, y, s), view.one)
             surface = nearest(ray, world, plan, no_surface(ray.origin.x), spheres)
             path = new_path(ray, None, surface, plan)
-            shown = emitted(surface, path, view.tables, plan)
+            shown = emitted(surface, path, view.tables, plan, view.one)
             ends = surface >= plan.first_lamp
             shown = tuple(jnp.where(ends, channel, 0.0) for channel in shown)
             return shown, jnp.where(path.alive, surface, -1)
