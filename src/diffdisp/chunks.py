@@ -25,7 +25,7 @@ from diffdisp.vector import Array, Real
 COLOR_RANGE = (0.38, 0.78)
 """Wavelengths that a colour picture is made of, µm."""
 
-CHUNKS_PER_CALL = 4
+CHUNKS_PER_CALL = 8
 """Chunks that one call of the compiled program renders: what stopping and progress wait for."""
 
 
