@@ -268,7 +268,7 @@ def test_of_one_coloured_surface_bands_are_nearly_exact():
         Sphere([0.9, 0, -1.5], 1.0), Lambertian(Checker([0.8, 0.3, 0.1], [0.8, 0.3, 0.1]))
     )
     scene = Scene(DISPERSION.camera, (DISPERSION.objects[0], painted), Background(WHITE))
-    assert bands_against_colour(scene, Film(32, 24), 64) <= 0.5
+    assert bands_against_colour(scene, Film(32, 24), 256) <= 0.5
 
 
 # --- progress

@@ -68,7 +68,8 @@ class Path(NamedTuple):
     """One path on its way to a surface that sends it on.
 
     `footprint` and `spectral` are None where nothing is integrated over the one, and where no
-    weight waits for the first dispersive glass.
+    weight waits for the first dispersive glass. So is `reflected`: what the path counts that is
+    reflected where both ways are taken, 0 if none is followed.
     """
 
     ray: Ray
@@ -80,6 +81,7 @@ class Path(NamedTuple):
     bounces: Int[Array, ""]
     alive: Array
     spectral: Array | None
+    reflected: Real | None
 
 
 def surfaces_of(scene: Scene) -> list[Object]:
@@ -341,9 +343,13 @@ def painted(
         waves.append(lambda ray: tuple(point(ray) * scale))
     is_cubes = _pick(paint.cubes, row) if tiled and cubed else None
     if path.footprint is None:
-        odd = _one_of([_is_odd(wave(path.ray)) for wave in waves], is_cubes)
+
+        def row_of_both() -> Array:
+            odd = _one_of([_is_odd(wave(path.ray)) for wave in waves], is_cubes)
+            return place + jnp.where(odd, mean[0].shape[0], 0)
+
         # Even and odd rows in one table: a look-up costs more than all else here.
-        place = place + jnp.where(odd, mean[0].shape[0], 0)
+        place = once(row_of_both, one)
         both = (jnp.concatenate([m + h, m - h]) for m, h in zip(mean, half, strict=True))
         return tuple(_pick(channel, place) for channel in both)
     mix = once(lambda: _one_of([_filtered(wave, path) for wave in waves], is_cubes), one)
@@ -483,6 +489,7 @@ def new_path(ray: Ray, footprint: tuple[Ray, Ray] | None, surface: Array, plan: 
     """A path that the camera sends to a surface."""
     zero = jnp.zeros_like(ray.direction.x)
     alive = (surface < plan.first_lamp) & (plan.depth > 1)
+    parts = plan.scattering and plan.dispersive
     return Path(
         ray,
         footprint,
@@ -492,7 +499,8 @@ def new_path(ray: Ray, footprint: tuple[Ray, Ray] | None, surface: Array, plan: 
         (zero,) * plan.channels,
         jnp.zeros(zero.shape, jnp.int32),
         alive,
-        jnp.zeros(zero.shape, bool) if plan.scattering and plan.dispersive else None,
+        jnp.zeros(zero.shape, bool) if parts else None,
+        zero if parts else None,
     )
 
 
@@ -570,7 +578,8 @@ def glass_interface(
 class Split(NamedTuple):
     """How both ways are taken where a sample meets dispersive glass first.
 
-    The reflected path serves all channels, for it goes the same way at all wavelengths.
+    The reflected path serves all channels, for it goes the same way at all wavelengths. It is
+    followed the more often the more light it carries, and counts the more the less often.
 
     Args:
         now: whether this is the sample's first surface, and glass.
@@ -742,7 +751,9 @@ def _go_on(
     alive = path.alive & goes_on & (brightest > setting.cutoff)
     alive = alive & (bounces < setting.plan.depth - 1)
     kept = choose(alive, moved._replace(bounces=bounces), path)
-    return kept._replace(radiance=radiance, alive=alive, spectral=moved.spectral)
+    return kept._replace(
+        radiance=radiance, alive=alive, spectral=moved.spectral, reflected=moved.reflected
+    )
 
 
 def _distance_to_ball(
@@ -772,6 +783,7 @@ class Scattered(NamedTuple):
         lamp_share: what the lamp's radiance counts if it is seen.
         lamp_total: density of lamp directions, for a unit of luminance.
         spectral: whether dispersive glass has been met.
+        reflected: as in `Path`.
     """
 
     ray: Ray
@@ -785,6 +797,7 @@ class Scattered(NamedTuple):
     lamp_share: Real | None
     lamp_total: Real | None
     spectral: Array | None
+    reflected: Real | None
 
 
 def _one_way(path: Path, setting: Setting) -> Path:
@@ -796,6 +809,7 @@ def _one_way(path: Path, setting: Setting) -> Path:
         last=path.surface,
         throughput=scattered.throughput,
         spectral=scattered.spectral,
+        reflected=scattered.reflected,
     )
     radiance, counts = path.radiance, path.alive
     if setting.always is not None:
@@ -828,9 +842,17 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
     first_matte, after_matte = plan.mattes
     is_matte = (surface >= first_matte) & (surface < after_matte)
     is_glass = surface < plan.balls
-    draw = partial(setting.draw, path.bounces)
+    draws = {0, 1} if plan.numbers_per_bounce > 1 else {0} if plan.random else set()
+    draws |= {2} if plan.fuzzy else set()
+    drawn = dict(
+        zip(
+            draws,
+            once(lambda: [setting.draw(path.bounces, number) for number in draws], setting.one),
+            strict=True,
+        )
+    )
 
-    point, outward, cosine = once(lambda: _meet(path, setting), setting.one)
+    point, outward, cosine = _meet(path, setting)
     leaves, cos_i = cosine > 0, jnp.abs(cosine)
     facing = choose(leaves, -outward, outward)
 
@@ -842,25 +864,31 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
             setting.one,
         )
 
-    def ways() -> tuple[Mix, Vec3 | None, Array, Channels | None]:
-        """How the new direction is mixed, of what, whether there is a surface, what goes there."""
-        unit, shares, zero = None, None, jnp.zeros_like(cosine)
+    def ways() -> tuple[Mix, Vec3 | None, Array, Channels | None, Real | None]:
+        """How the new direction is mixed, of what, whether there is a surface, what goes there.
+
+        And what a reflected path counts that is to follow this one.
+        """
+        unit, shares, zero, reflected = None, None, jnp.zeros_like(cosine), path.reflected
         mix, differ = Mix(*reflection(cos_i), zero), jnp.ones(cosine.shape, bool)
         if plan.numbers_per_bounce > 1:
-            unit = uniform_direction(draw(0), draw(1))
+            unit = uniform_direction(drawn[0], drawn[1])
         if plan.fuzzy:
             metal = jnp.where(surface < first_matte, surface, surface - after_matte + first_matte)
             fuzz = _pick(world.fuzz, jnp.clip(metal - plan.balls, 0, plan.metals - 1))
             # The radius of a uniform point of the unit ball: the cube root, by its logarithm.
-            radius = jnp.exp(jnp.log(jnp.maximum(draw(2), 1e-12)) * (1.0 / 3.0))
+            radius = jnp.exp(jnp.log(jnp.maximum(drawn[2], 1e-12)) * (1.0 / 3.0))
             mix = mix._replace(unit=radius * fuzz)
         if after_matte > first_matte:
             mix = choose(is_matte, Mix(zero, zero + 1.0, zero + 1.0), mix)
         if media is not None:
             glass = glass_interface(media, cos_i, leaves)
-            mirrored: Array = draw(0) < jax.lax.stop_gradient(glass.reflectance)
+            mirrored: Array = drawn[0] < jax.lax.stop_gradient(glass.reflectance)
             if setting.split is not None:
-                mirrored, shares = _parted(mirrored, glass, cos_i, leaves, setting.split)
+                assert reflected is not None
+                mirrored, shares, reflected = _parted(
+                    mirrored, glass, cos_i, leaves, setting.split, reflected, drawn[0]
+                )
             elif setting.differentiable:
                 share = jnp.where(mirrored, glass.reflectance, 1.0 - glass.reflectance)
                 share = jnp.where(is_glass & (share > 0), share, 1.0)
@@ -869,9 +897,9 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
             through = choose(mirrored, Mix(*reflection(cos_i), zero), bent)
             mix = choose(is_glass, through, mix)
             differ = jnp.asarray(glass.differ | ~is_glass)
-        return mix, unit, differ, shares
+        return mix, unit, differ, shares, reflected
 
-    mix, unit, differ, shares = once(ways, setting.one)
+    mix, unit, differ, shares, reflected = once(ways, setting.one)
 
     def mixed() -> Vec3:
         """The new direction, of any length."""
@@ -910,25 +938,67 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
                 )
         ray = Ray(point, direction)
         return Scattered(
-            ray, throughput, goes_on, differ, is_matte, None, None, None, None, None, spectral
+            ray,
+            throughput,
+            goes_on,
+            differ,
+            is_matte,
+            None,
+            None,
+            None,
+            None,
+            None,
+            spectral,
+            reflected,
         )
 
     scattered = once(finished, setting.one)
-    return _aim(scattered, facing, draw, setting) if plan.lit else scattered
+    return (
+        _aim(scattered, facing, partial(setting.draw, path.bounces), setting)
+        if plan.lit
+        else scattered
+    )
+
+
+FOLLOWED = 8.0
+"""How much more often a reflected path is followed than light goes its way: noise against time."""
 
 
 def _parted(
-    mirrored: Array, glass: Interface, cos_i: Real, leaves: Array, split: Split
-) -> tuple[Array, Channels]:
-    """Whether a path is reflected, and its share of the light, where the ways may part."""
+    mirrored: Array,
+    glass: Interface,
+    cos_i: Real,
+    leaves: Array,
+    split: Split,
+    reflected: Real,
+    u: Real,
+) -> tuple[Array, Channels, Real]:
+    """Whether a path is reflected, its share of the light, and what one counts that is to be.
+
+    Args:
+        mirrored: whether it is where the ways do not part.
+        glass: the surface.
+        cos_i: cosine of the angle of incidence.
+        leaves: whether the ray leaves the ball.
+        split: how the ways part.
+        reflected: of the path until now.
+        u: a number in [0, 1).
+    """
     shares = []
     for ratio in split.ratios:
         eta = glass.eta * choose(leaves, 1.0 / ratio, ratio)
         reflectance = fresnel_reflectance(cos_i, cos_transmitted(cos_i, eta), eta)
-        reflectance = jnp.where(glass.differ, reflectance, 0.0)
+        reflectance = jnp.where(glass.differ, reflectance, 0.0) * reflected
         share = jnp.where(split.reflects, reflectance, 1.0 - glass.reflectance)
         shares.append(jnp.where(split.now, share, 1.0))
-    return jnp.where(split.now, split.reflects, mirrored), tuple(shares)
+    chance = jnp.minimum(FOLLOWED * glass.reflectance, 1.0)
+    counts = jnp.where(u < chance, 1.0 / jnp.where(chance > 0, chance, 1.0), 0.0)
+    parts = split.now & ~split.reflects
+    return (
+        jnp.where(split.now, split.reflects, mirrored),
+        tuple(shares),
+        jnp.where(parts, counts, reflected),
+    )
 
 
 class Mix(NamedTuple):
@@ -950,23 +1020,32 @@ def _meet(path: Path, setting: Setting) -> tuple[Vec3, Vec3, Real]:
     """
     (world, *_), plan, ray, surface = setting.tables, setting.plan, path.ray, path.surface
     rows = plan.first_plane
-    if rows:
+
+    def to_sphere() -> tuple[Vec3, Real, Real]:
         row = jnp.minimum(surface, rows - 1)
         center, radius = _pick_vector(world.centers, row), _pick(world.radii, row)
-        again = path.last == surface
-        distance, _ = first_distance(ray, center, radius, again)
-        outward = normalize(ray.origin + ray.direction * distance - center)
-        # Back onto the sphere: in float32 the ray ends some way off a large one.
-        point = center + outward * radius
-    if plan.matte_planes + plan.metal_planes:
-        plane, on_plane = _plane_row(surface, plan), surface >= rows
-        normal = _pick_vector(world.normals, plane)
-        flat = _on_plane(ray, plane, on_plane, world)
-        flat = flat - normal * (flat - _pick_vector(world.points, plane)).dot(normal)
-        point, outward = choose(
-            on_plane, (flat, normal), (point, outward) if rows else (flat, normal)
-        )
-    return point, outward, ray.direction.dot(outward)
+        distance, _ = first_distance(ray, center, radius, path.last == surface)
+        return center, radius, distance
+
+    sphere = once(to_sphere, setting.one) if rows else None
+
+    def meeting() -> tuple[Vec3, Vec3, Real]:
+        if sphere is not None:
+            center, radius, distance = sphere
+            outward = normalize(ray.origin + ray.direction * distance - center)
+            # Back onto the sphere: in float32 the ray ends some way off a large one.
+            point = center + outward * radius
+        if plan.matte_planes + plan.metal_planes:
+            plane, on_plane = _plane_row(surface, plan), surface >= rows
+            normal = _pick_vector(world.normals, plane)
+            flat = _on_plane(ray, plane, on_plane, world)
+            flat = flat - normal * (flat - _pick_vector(world.points, plane)).dot(normal)
+            point, outward = choose(
+                on_plane, (flat, normal), (point, outward) if rows else (flat, normal)
+            )
+        return point, outward, ray.direction.dot(outward)
+
+    return once(meeting, setting.one)
 
 
 # Lamps: the next segment of a path from a matte surface is chosen both by its cosine and by the

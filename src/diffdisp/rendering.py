@@ -50,7 +50,7 @@ from diffdisp.wavefront import (
     visible_tiles,
 )
 
-PASS_PATHS = 1 << 24
+PASS_PATHS = 1 << 26
 """Film samples of a pass over the picture, which a growing picture grows by: a second or a few."""
 
 ENOUGH_STRATA = 16

@@ -37,10 +37,10 @@ from diffdisp.sampling import Numbers
 from diffdisp.scene import Scene
 from diffdisp.vector import Array, Real, Vec3, choose, vec3
 
-LANES = 2048
+LANES = 1280
 """Lanes that advance together: their state stays in the cache of a core."""
 
-IDLE = 1 / 3
+IDLE = 1 / 4
 """Share of lanes that may idle before they are given new pixels."""
 
 GROUP = 4
@@ -184,7 +184,10 @@ def visible_tiles(scene: Scene, film: Film, plan: Plan, edge: int, workers: int)
             np.asarray(len(of), np.int32),
         )
 
-    return [part(of) for of in np.array_split(some, parts)] if parts else []
+    # Each part takes from above and from below: sky takes less time than what is under it.
+    pieces = np.array_split(some, 2 * parts) if parts else []
+    pairs = zip(pieces[:parts], pieces[parts:][::-1], strict=True)
+    return [part(np.concatenate(pair)) for pair in pairs]
 
 
 def _in_view(
@@ -251,7 +254,9 @@ def _sample_ray(plan: Plan, view: View, samples: FilmSamples, x: Array, y: Array
     """The camera ray of sample `s` of the pixel in column `x` and row `y`."""
     numbers, pixel = _numbers(plan, view), _pixel_number(view, x, y)
     word = samples.number[s]
-    across, down = (numbers.of_film(pixel, word, axis) for axis in (0, 1))
+    across, down = once(
+        lambda: tuple(numbers.of_film(pixel, word, axis) for axis in (0, 1)), view.one
+    )
     middle = (0.5 * view.width.astype(plan.dtype), 0.5 * view.height.astype(plan.dtype))
     return camera_ray(
         view.camera,
@@ -346,11 +351,11 @@ def _follow(
     length: Int[Array, ""],
 ) -> tuple[Array, ...]:
     """The sum of each pixel's samples that went on, a channel each, with a place to spare."""
-    pixels = waiting.shape[0]
+    pixels, waves = waiting.shape[0], samples.indices.shape[1]
     advance = jax.vmap(lambda lane: _advance(lane, plan, view, samples, hits))
 
     def busy(lane: Lane) -> Array:
-        return lane.path.alive | (lane.waiting != 0) | _splits(lane)
+        return lane.path.alive | (lane.waiting != 0) | _splits(lane, waves)
 
     def collect(lane: Lane, results: tuple[Array, ...]) -> tuple[Array, ...]:
         slot = jnp.where(busy(lane), pixels, lane.slot)
@@ -450,20 +455,23 @@ def _advance(lane: Lane, plan: Plan, view: View, samples: FilmSamples, hits: Arr
     return lane._replace(path=bounce(lane.path, setting))
 
 
-def _splits(lane: Lane) -> Array:
+def _splits(lane: Lane, waves: int) -> Array:
     """Whether a path has ended that others of its sample have to follow."""
     if lane.wave is None:
         return jnp.zeros_like(lane.path.alive)
     assert lane.way is not None
     assert lane.path.spectral is not None
+    assert lane.path.reflected is not None
     more = lane.path.spectral & (lane.wave == 0)
-    return ~lane.path.alive & (more | (lane.way == THROUGH))
+    through = (lane.way == THROUGH) & ((lane.wave + 1 < waves) | (lane.path.reflected > 0))
+    return ~lane.path.alive & (more | through)
 
 
 def _next_sample(lane: Lane, plan: Plan, view: View, samples: FilmSamples, hits: Array) -> Lane:
     """The lane with the path of its next sample or wavelength, where the present one has ended."""
     lowest = lane.waiting & (~lane.waiting + np.uint32(1))
-    again = _splits(lane)
+    waves = samples.indices.shape[1]
+    again = _splits(lane, waves)
     starts = ~lane.path.alive & (again | (lane.waiting != 0))
     following = jax.lax.population_count(lowest - np.uint32(1)).astype(jnp.int32)
     sample = jnp.where(again, lane.sample, jnp.minimum(following, plan.samples - 1))
@@ -475,7 +483,10 @@ def _next_sample(lane: Lane, plan: Plan, view: View, samples: FilmSamples, hits:
     )
     if lane.wave is not None:
         assert lane.way is not None
-        turns = again & (lane.wave + 1 == samples.indices.shape[1])
+        assert lane.path.reflected is not None
+        counts = jnp.where(again, lane.path.reflected, 0.0)
+        new = new._replace(path=path._replace(reflected=counts))
+        turns = again & (lane.wave + 1 == waves)
         at_glass = surface < plan.balls
         first, way = jnp.where(at_glass, FIRST_THROUGH, 0), jnp.where(at_glass, THROUGH, NO_GLASS)
         new = new._replace(
