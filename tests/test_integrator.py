@@ -74,6 +74,7 @@ def path_at(impact):
         bounces=jnp.array(0, jnp.int32),
         alive=jnp.array(True),
         spectral=None,
+        reflected=None,
     )
 
 

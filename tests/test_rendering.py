@@ -19,7 +19,7 @@ from helpers import (
     screen,
 )
 
-from diffdisp import chunks, rendering
+from diffdisp import chunks, integrator, rendering
 from diffdisp.camera import Camera
 from diffdisp.dispersion import Sellmeier
 from diffdisp.film import Film
@@ -458,6 +458,17 @@ def test_the_picture_does_not_depend_on_chunks(length, monkeypatch):
     monkeypatch.setattr(rendering, "chunk_pixels", lambda film, plan: length)
     # Loops of another length are vectorised in other places.
     np.testing.assert_allclose(render(scene, BANDS, samples=4, depth=50), whole, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("block", [50, 1 << 20])
+def test_the_picture_does_not_depend_on_which_paths_move_up(block, monkeypatch):
+    scene = furnace(*SEPARATE["apart"], color=[0.1, 0.2, 0.3])
+    whole = render(scene, BANDS, samples=4, depth=50)
+    monkeypatch.setattr(integrator, "BLOCK", block)
+    jax.clear_caches()
+    blocks = render(scene, BANDS, samples=4, depth=50)
+    jax.clear_caches()
+    np.testing.assert_allclose(blocks, whole, rtol=0, atol=1e-12)  # as above
 
 
 def test_the_picture_does_not_depend_on_threads(monkeypatch):
