@@ -131,7 +131,7 @@ def check_glasses(scene: Scene, low: float, high: float) -> None:
 
 
 def chunk_pixels(film: Film, plan: Plan) -> int:
-    """Pixels of a chunk: few enough that its paths stay in the cache, enough to fill a GPU."""
+    """Pixels of a chunk: enough to fill its blocks, or a GPU; few enough to stay in a cache."""
     lanes = {"cpu": 65536 // np.dtype(plan.dtype).itemsize}.get(jax.default_backend(), 1 << 18)
     waves = plan.wavelengths_per_sample if film.wavelengths is None else film.channels
     return int(np.clip(lanes // (plan.samples * (waves if plan.dispersive else 1)), 1, 1024))

@@ -777,13 +777,14 @@ class Scattered(NamedTuple):
         goes_on: whether any light goes that way.
         differ: whether there was a surface at all: between equal media there is none.
         matte: whether the surface is matte.
-        density: of the chosen direction, in solid angle, where matte.
+        spectral: whether dispersive glass has been met.
+        reflected: as in `Path`.
+        density: of the chosen direction, in solid angle, where matte; None, as the others, where
+            no lamps are aimed at.
         lamp: number of the lamp that the ray `to_lamp` aims at.
         to_lamp: a ray to a point of that lamp.
         lamp_share: what the lamp's radiance counts if it is seen.
         lamp_total: density of lamp directions, for a unit of luminance.
-        spectral: whether dispersive glass has been met.
-        reflected: as in `Path`.
     """
 
     ray: Ray
@@ -791,13 +792,13 @@ class Scattered(NamedTuple):
     goes_on: Array
     differ: Array
     matte: Array
-    density: Real | None
-    lamp: Array | None
-    to_lamp: Ray | None
-    lamp_share: Real | None
-    lamp_total: Real | None
     spectral: Array | None
     reflected: Real | None
+    density: Real | None = None
+    lamp: Array | None = None
+    to_lamp: Ray | None = None
+    lamp_share: Real | None = None
+    lamp_total: Real | None = None
 
 
 def _one_way(path: Path, setting: Setting) -> Path:
@@ -842,15 +843,8 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
     first_matte, after_matte = plan.mattes
     is_matte = (surface >= first_matte) & (surface < after_matte)
     is_glass = surface < plan.balls
-    draws = {0, 1} if plan.numbers_per_bounce > 1 else {0} if plan.random else set()
-    draws |= {2} if plan.fuzzy else set()
-    drawn = dict(
-        zip(
-            draws,
-            once(lambda: [setting.draw(path.bounces, number) for number in draws], setting.one),
-            strict=True,
-        )
-    )
+    count = 3 if plan.fuzzy else min(plan.numbers_per_bounce, 2)
+    drawn = once(lambda: [setting.draw(path.bounces, k) for k in range(count)], setting.one)
 
     point, outward, cosine = _meet(path, setting)
     leaves, cos_i = cosine > 0, jnp.abs(cosine)
@@ -937,20 +931,7 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
                     for t, w in zip(throughput, setting.weights, strict=True)
                 )
         ray = Ray(point, direction)
-        return Scattered(
-            ray,
-            throughput,
-            goes_on,
-            differ,
-            is_matte,
-            None,
-            None,
-            None,
-            None,
-            None,
-            spectral,
-            reflected,
-        )
+        return Scattered(ray, throughput, goes_on, differ, is_matte, spectral, reflected)
 
     scattered = once(finished, setting.one)
     return (

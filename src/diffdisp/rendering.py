@@ -269,11 +269,11 @@ def _calls(work: _Work, film: Film, spectrum: Spectrum, run: RunNumbers) -> list
         pairs = zip(np.asarray(spectrum.wavelengths), np.asarray(spectrum.basis), strict=True)
         bands = [Spectrum(wavelength[None], basis[None], None) for wavelength, basis in pairs]
         channels = [slice(band, band + 1) for band in range(len(bands))]
-    return [
-        _Call(plain((work.scene, band, film_size(film), run, part), work.plan.dtype), fills)
-        for band, fills in zip(bands, channels, strict=True)
-        for part in work.tiles
-    ]
+    calls = []
+    for band, fills in zip(bands, channels, strict=True):
+        fixed = plain((work.scene, band, film_size(film), run), work.plan.dtype)
+        calls += [_Call((*fixed, part), fills) for part in work.tiles]
+    return calls
 
 
 def _trace_program(plan: Plan, arguments: tuple[Any, ...]) -> Program:
