@@ -178,6 +178,7 @@ class Candidates(NamedTuple):
         groups: how many groups of `group` rows count.
         group: rows of a group, which are taken together.
         several: whether there may be more groups than one.
+        one: as in `once`.
     """
 
     centers: Vec3
@@ -186,6 +187,7 @@ class Candidates(NamedTuple):
     groups: Int[Array, ""] | int
     group: int
     several: bool
+    one: Array | None
 
 
 MOST_TOGETHER = 8
@@ -205,9 +207,10 @@ def all_spheres(world: World, plan: Plan, one: Array | None) -> Candidates:
         Vec3(*map(filled, world.centers)),
         filled(world.radii),
         filled(surface_numbers(plan)[0]),
-        groups if one is None else groups * one,
+        groups,
         group,
         groups > 1,
+        one,
     )
 
 
@@ -250,8 +253,7 @@ def nearest(ray: Ray, world: World, plan: Plan, last: Array, spheres: Candidates
     best: Array = none
     group: Array = jnp.zeros_like(last)
     if spheres.group and not spheres.several:
-        # A loop, as in `once`; and what a loop counts it does not lay out beforehand, row by row.
-        best = jax.lax.fori_loop(0, spheres.groups, lambda turn, _: of_group(turn), none)
+        best = once(lambda: of_group(0), spheres.one)
     elif spheres.group:
 
         def turn(number: Array, carried: Any) -> Any:
@@ -1164,36 +1166,24 @@ def _chance_weight(surface: Array, scattered: Scattered, tables: Tables, plan: P
     return jnp.where(weighed, weight, 1.0)
 
 
-def once(stage: Callable[[], Any], one: Array | None) -> Any:
+def once(stage: Callable[[], Any], one: Array | None = None) -> Any:
     """`stage()`, computed once.
 
     XLA's CPU backend fuses loops by computing a value again in each of its users, through any
-    number of stages. A loop is a border that it does not fuse across, and one whose trip count is
-    known only at run time it does not unroll. Without `one` the stage is called as it is, as
-    reverse mode needs it.
+    number of stages. It does not fuse across an optimization barrier, if it is told to keep it
+    (`programs.OPTIONS`). Elsewhere, as in a user's own program, a branch is a border.
 
     Args:
         stage: what to compute.
-        one: the number 1, as an array that the compiler does not know.
+        one: the number 1, as an array that the compiler does not know: for a branch. None for a
+            barrier, which has all derivatives.
     """
     if one is None:
-        return stage()
-    # Traced here, so that the loop need not trace it again.
-    traced, shape = jax.make_jaxpr(stage, return_shape=True)()
-    structure = jax.tree.structure(shape)
-    empty = [jnp.zeros(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(shape)]
-
-    def again(turn: Array, old: list[Array]) -> list[Array]:
-        # What does not depend on the turn would be moved out of the loop, and be fused there.
-        first = turn < one
-
-        def of_turn(value: Any) -> Any:
-            number = isinstance(value, jax.core.Tracer) and value.ndim == 0
-            return jnp.where(first, value, jnp.zeros_like(value)) if number else value
-
-        return jax.core.eval_jaxpr(traced.jaxpr, [of_turn(value) for value in traced.consts])
-
-    return jax.tree.unflatten(structure, jax.lax.fori_loop(jnp.zeros_like(one), one, again, empty))
+        return jax.lax.optimization_barrier(stage())  # type: ignore[no-untyped-call]
+    shape = jax.eval_shape(stage)
+    return jax.lax.cond(
+        one > 0, stage, lambda: jax.tree.map(lambda of: jnp.zeros(of.shape, of.dtype), shape)
+    )
 
 
 class Lanes(NamedTuple):
@@ -1412,12 +1402,7 @@ def _until_done(enter: Step | None, advance: Step, paths: Path, plan: Plan) -> P
             path = step(lane, path, count)
             pairs = zip(results, path.radiance, strict=True)
             results = tuple(whole.at[lane].set(part) for whole, part in pairs)
-            place = jnp.where(path.alive, jnp.cumsum(path.alive, dtype=jnp.int32) - 1, block)
-            order = (
-                jnp.zeros(block, jnp.int32)
-                .at[place]
-                .set(np.arange(block, dtype=np.int32), mode="drop")
-            )
+            order = first_places(path.alive)
             lanes = jax.tree.map(
                 lambda whole, part: jax.lax.dynamic_update_slice_in_dim(
                     whole, look_up(part, order), kept, 0
@@ -1453,6 +1438,14 @@ def _until_done(enter: Step | None, advance: Step, paths: Path, plan: Plan) -> P
         state = sweep(once_in, state)
     state = jax.lax.while_loop(lambda state: state[1] > 0, partial(sweep, thinned), state)
     return paths._replace(radiance=tuple(channel[:total] for channel in state[2]))
+
+
+def first_places(chosen: Bool[Array, " places"]) -> Int[Array, " places"]:
+    """The places that are chosen, in their order; then zeros."""
+    count = chosen.shape[0]
+    order = jnp.where(chosen, jnp.cumsum(chosen, dtype=jnp.int32) - 1, count)
+    places = np.arange(count, dtype=np.int32)
+    return jnp.zeros(count, jnp.int32).at[order].set(places, mode="drop")
 
 
 def _bounded(enter: Step | None, advance: Step, paths: Path, plan: Plan) -> Path:

@@ -40,11 +40,11 @@ from diffdisp.programs import Program, program
 from diffdisp.scene import Scene, without_names
 from diffdisp.vector import Real
 from diffdisp.wavefront import (
-    LANES,
     MOST_SAMPLES,
     FilmSamples,
     Tiles,
     View,
+    lanes_for,
     tile_edge,
     trace_tiles,
     visible_tiles,
@@ -279,7 +279,8 @@ def _calls(work: _Work, film: Film, spectrum: Spectrum, run: RunNumbers) -> list
 def _trace_program(plan: Plan, arguments: tuple[Any, ...]) -> Program:
     """The compiled program of the wavefront loop."""
     with jax.enable_x64(plan.dtype == "float64"):
-        return program(trace_picture, (plan, tile_edge(plan.samples), LANES), arguments)
+        edge = tile_edge(plan.samples)
+        return program(trace_picture, (plan, edge, lanes_for(arguments[-1], edge)), arguments)
 
 
 def _background(scene: Scene, spectrum: Spectrum) -> np.ndarray:
@@ -321,7 +322,7 @@ def trace_picture(
     )
     width, height = (edge.astype(jnp.int32) for edge in size)
     tables = Tables(world_tables(scene), paint)
-    view = View(tables, scene.camera, width, height, run.seed, run.cutoff, run.one)
+    view = View(tables, scene.camera, width, height, run.seed, run.cutoff)
     return trace_tiles(plan, edge, lanes, view, samples, tiles)
 
 

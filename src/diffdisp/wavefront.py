@@ -24,6 +24,7 @@ from diffdisp.integrator import (
     Tables,
     bounce,
     emitted,
+    first_places,
     look_up,
     nearest,
     new_path,
@@ -37,8 +38,9 @@ from diffdisp.sampling import Numbers
 from diffdisp.scene import Scene
 from diffdisp.vector import Array, Real, Vec3, choose, vec3
 
-LANES = 1280
-"""Lanes that advance together: their state stays in the cache of a core."""
+LANES = 1024
+"""Lanes that advance together: their state stays in the cache of a core. Half as many where a part
+of a picture is small: a larger share of its time goes to waiting for the last path."""
 
 IDLE = 1 / 4
 """Share of lanes that may idle before they are given new pixels."""
@@ -51,7 +53,10 @@ MOST_SAMPLES = 32
 
 
 PIXELS = 1 << 17
-"""Pixels that one call of the compiled program has room for."""
+"""Pixels that one call of the compiled program has room for, in a large picture."""
+
+STRIPS = 16
+"""Strips of a picture, at least, that are dealt out to its parts."""
 
 
 class Tiles(NamedTuple):
@@ -98,7 +103,7 @@ class FilmSamples(NamedTuple):
 
 
 class View(NamedTuple):
-    """A scene and a film, as the wavefront sees them; sizes in pixels, `one` as in `once`."""
+    """A scene and a film, as the wavefront sees them; sizes in pixels."""
 
     tables: Tables
     camera: Camera
@@ -106,7 +111,6 @@ class View(NamedTuple):
     height: Int[Array, ""]
     seed: Array
     cutoff: Real
-    one: Array
 
 
 class Lane(NamedTuple):
@@ -168,9 +172,9 @@ def visible_tiles(scene: Scene, film: Film, plan: Plan, edge: int, workers: int)
     width = -(-len(spheres) // GROUP) * GROUP
     rows = np.where(np.arange(len(spheres)) < counts[:, None], rows, len(spheres))
     rows = np.pad(rows, ((0, 0), (0, width - len(spheres))), constant_values=len(spheres))
-    capacity = max(1, PIXELS // edge**2)
-    if len(some) <= workers * max(1, capacity // 16):  # a small picture is laid out in small arrays
-        capacity = max(1, capacity // 16)
+    # A small picture is laid out in small arrays.
+    capacities = [max(1, (PIXELS >> shift) // edge**2) for shift in (5, 3, 1, 0)]
+    capacity = next((c for c in capacities if len(some) <= workers * c), capacities[-1])
     # Equal parts, a multiple of the workers', each with room for all lanes.
     parts = min(-(-len(some) // (capacity * workers)) * workers, len(some))
 
@@ -184,10 +188,18 @@ def visible_tiles(scene: Scene, film: Film, plan: Plan, edge: int, workers: int)
             np.asarray(len(of), np.int32),
         )
 
-    # Each part takes from above and from below: sky takes less time than what is under it.
-    pieces = np.array_split(some, 2 * parts) if parts else []
-    pairs = zip(pieces[:parts], pieces[parts:][::-1], strict=True)
-    return [part(np.concatenate(pair)) for pair in pairs]
+    # Each part takes from all over the picture, for sky takes less time than what is under it; but
+    # in whole strips, for paths that are alike take less than others.
+    turns = [*range(parts), *reversed(range(parts))]
+    turns *= -(-STRIPS // max(len(turns), 1))
+    strips = np.array_split(some, len(turns)) if parts else []
+    shares = [[s for s, of in zip(strips, turns, strict=True) if of == k] for k in range(parts)]
+    return [part(np.concatenate(share)) for share in shares]
+
+
+def lanes_for(part: Tiles, edge: int) -> int:
+    """Lanes that follow the paths of a part of a picture."""
+    return LANES if part.x.shape[0] >= PIXELS // edge**2 else LANES // 2
 
 
 def _in_view(
@@ -225,6 +237,47 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
+class Queue(NamedTuple):
+    """Pixels of which samples go on, those that have most to do before the others.
+
+    Where a scene has glass there are two rows: those with samples that meet it, and the others.
+    Paths through glass are the longest, and the last one is waited for by all lanes.
+
+    Args:
+        pixels: their numbers, from the start of each row.
+        lengths: how many of a row count.
+    """
+
+    pixels: Int[Array, "rows places"]
+    lengths: Int[Array, " rows"]
+
+    def longer(self, first: Array, kinds: list[Array]) -> "Queue":
+        """The queue with some of the pixels of a tile.
+
+        Args:
+            first: the tile's first pixel.
+            kinds: for each row, whether the tile's pixels belong there.
+        """
+        pixels = self.pixels
+        for row, chosen in enumerate(kinds):
+            # The tile writes to as many places as it has pixels; the next takes those left over.
+            places = np.int32(row), self.lengths[row]
+            part = (first + first_places(chosen))[None]
+            pixels = jax.lax.dynamic_update_slice(pixels, part, places)
+        counts = [jnp.sum(chosen, dtype=jnp.int32) for chosen in kinds]
+        return Queue(pixels, self.lengths + jnp.stack(counts))
+
+    def at(self, place: Array) -> Array:
+        """The pixels at some places, which may be past the end."""
+        last = self.pixels.shape[1] - 1
+        row: Array = jnp.zeros_like(place)
+        column = place
+        if self.lengths.shape[0] > 1:
+            row = (place >= self.lengths[0]).astype(jnp.int32)
+            column = place - row * self.lengths[0]
+        return look_up(self.pixels, row, jnp.minimum(column, last))
+
+
 def trace_tiles(
     plan: Plan, edge: int, lanes: int, view: View, samples: FilmSamples, tiles: Tiles
 ) -> Float[jax.Array, "tiles pixels channels"]:
@@ -238,14 +291,8 @@ def trace_tiles(
         samples: of each pixel.
         tiles: which pixels.
     """
-    shown, waiting, hits = _first_hits(plan, edge, view, samples, tiles)
-    pixels = waiting.shape[0]
-    place = jnp.cumsum(waiting != 0, dtype=jnp.int32) - 1
-    queue = jnp.zeros(pixels + 1, jnp.int32)
-    queue = queue.at[jnp.where(waiting != 0, place, pixels)].set(np.arange(pixels, dtype=np.int32))
-    collected = _follow(
-        plan, edge, lanes, view, samples, tiles, waiting, hits, queue, place[-1] + 1
-    )
+    shown, waiting, hits, queue = _first_hits(plan, edge, view, samples, tiles)
+    collected = _follow(plan, edge, lanes, view, samples, tiles, waiting, hits, queue)
     total = [s + c[:-1] for s, c in zip(shown, collected, strict=True)]
     return jnp.stack(total, axis=-1).reshape(-1, edge * edge, len(total)) * (1.0 / plan.samples)
 
@@ -254,9 +301,7 @@ def _sample_ray(plan: Plan, view: View, samples: FilmSamples, x: Array, y: Array
     """The camera ray of sample `s` of the pixel in column `x` and row `y`."""
     numbers, pixel = _numbers(plan, view), _pixel_number(view, x, y)
     word = samples.number[s]
-    across, down = once(
-        lambda: tuple(numbers.of_film(pixel, word, axis) for axis in (0, 1)), view.one
-    )
+    across, down = once(lambda: tuple(numbers.of_film(pixel, word, axis) for axis in (0, 1)), None)
     middle = (0.5 * view.width.astype(plan.dtype), 0.5 * view.height.astype(plan.dtype))
     return camera_ray(
         view.camera,
@@ -277,12 +322,13 @@ def _pixel_number(view: View, x: Array, y: Array) -> Array:
 
 def _first_hits(
     plan: Plan, edge: int, view: View, samples: FilmSamples, tiles: Tiles
-) -> tuple[list[Array], Array, Array]:
+) -> tuple[list[Array], Array, Array, Queue]:
     """What the camera sees.
 
     Returns:
         For each pixel the sum of what its samples see that end at once, a list of channels; a bit
-        for each sample that goes on; and for (pixel, sample) in one axis the surface it meets.
+        for each sample that goes on; for (pixel, sample) in one axis the surface it meets; and
+        the pixels with samples that go on.
     """
     size, capacity = edge * edge, tiles.x.shape[0]
     y, x = np.divmod(np.arange(size, dtype=np.int32), np.int32(edge))
@@ -292,7 +338,7 @@ def _first_hits(
     radii = jnp.append(world.radii, 0.0)
     numbers = jnp.asarray(np.append(surface_numbers(plan)[0], np.int32(0)))
 
-    def see(tile: Array) -> tuple[tuple[Array, ...], Array, Array]:
+    def see(tile: Array) -> tuple[tuple[Array, ...], Array, Array, list[Array]]:
         rows = tiles.candidates[tile]
         spheres = Candidates(
             Vec3(*(axis[rows] for axis in centers)),
@@ -301,13 +347,14 @@ def _first_hits(
             tiles.groups[tile],
             GROUP if plan.spheres else 0,
             True,
+            None,
         )
 
         def one_sample(x: Array, y: Array, s: Array) -> tuple[tuple[Real, ...], Array]:
-            ray = once(lambda: _sample_ray(plan, view, samples, x, y, s), view.one)
+            ray = once(lambda: _sample_ray(plan, view, samples, x, y, s))
             surface = nearest(ray, world, plan, no_surface(ray.origin.x), spheres)
             path = new_path(ray, None, surface, plan)
-            shown = emitted(surface, path, view.tables, plan, view.one)
+            shown = emitted(surface, path, view.tables, plan, None)
             ends = surface >= plan.first_lamp
             shown = tuple(jnp.where(ends, channel, 0.0) for channel in shown)
             return shown, jnp.where(path.alive, surface, -1)
@@ -321,21 +368,30 @@ def _first_hits(
         bits = np.uint32(1) << np.arange(plan.samples, dtype=np.uint32)
         goes_on = (surface >= 0) & inside[:, None]
         waiting = jnp.sum(jnp.where(goes_on, bits, np.uint32(0)), axis=-1, dtype=jnp.uint32)
-        return tuple(jnp.sum(channel, axis=-1) for channel in shown), waiting, surface.reshape(-1)
+        kinds: list[Array] = [waiting != 0]
+        if plan.balls:
+            at_glass = jnp.any(goes_on & (surface < plan.balls), axis=-1)
+            kinds = [at_glass, kinds[0] & ~at_glass]
+        seen = tuple(jnp.sum(channel, axis=-1) for channel in shown)
+        return seen, waiting, surface.reshape(-1), kinds
 
-    def put(tile: Array, results: Any) -> Any:
+    def put(tile: Array, state: Any) -> Any:
         def at(whole: Array, part: Array) -> Array:
             return jax.lax.dynamic_update_slice(whole, part, (tile * part.shape[0],))
 
-        return jax.tree.map(at, results, see(tile))
+        results, queue = state
+        *found, kinds = see(tile)
+        return jax.tree.map(at, results, tuple(found)), queue.longer(tile * size, kinds)
 
     empty = (
         tuple(jnp.zeros(capacity * size, plan.dtype) for _ in range(plan.channels)),
         jnp.zeros(capacity * size, jnp.uint32),
         jnp.zeros(capacity * size * plan.samples, jnp.int32),
     )
-    shown, waiting, hits = jax.lax.fori_loop(0, tiles.filled, put, empty)
-    return list(shown), waiting, hits
+    rows = 2 if plan.balls else 1
+    nobody = Queue(jnp.zeros((rows, (capacity + 1) * size), jnp.int32), jnp.zeros(rows, jnp.int32))
+    (shown, waiting, hits), queue = jax.lax.fori_loop(0, tiles.filled, put, (empty, nobody))
+    return list(shown), waiting, hits, queue
 
 
 def _follow(
@@ -347,11 +403,11 @@ def _follow(
     tiles: Tiles,
     waiting: UInt32[Array, " pixels"],
     hits: Int[Array, " pixel_samples"],
-    queue: Int[Array, " places"],
-    length: Int[Array, ""],
+    queue: Queue,
 ) -> tuple[Array, ...]:
     """The sum of each pixel's samples that went on, a channel each, with a place to spare."""
     pixels, waves = waiting.shape[0], samples.indices.shape[1]
+    length = jnp.sum(queue.lengths, dtype=jnp.int32)
     advance = jax.vmap(lambda lane: _advance(lane, plan, view, samples, hits))
 
     def busy(lane: Lane) -> Array:
@@ -366,7 +422,7 @@ def _follow(
         idle = ~busy(lane)
         place = taken + jnp.cumsum(idle, dtype=jnp.int32) - 1
         fresh = idle & (place < length)
-        slot = queue[jnp.where(fresh, place, pixels)]
+        slot = queue.at(place)
         tile, pixel = slot // (edge * edge), slot % (edge * edge)
         renewed = lane._replace(
             slot=slot,
@@ -421,7 +477,7 @@ def _idle_lanes(plan: Plan, lanes: int, sink: int, view: View) -> Lane:
 
 def _advance(lane: Lane, plan: Plan, view: View, samples: FilmSamples, hits: Array) -> Lane:
     """The lane's path advanced by one surface; where it has ended, that of its next sample."""
-    lane = once(lambda: _next_sample(lane, plan, view, samples, hits), view.one)
+    lane = once(lambda: _next_sample(lane, plan, view, samples, hits))
     numbers, pixel = _numbers(plan, view), _pixel_number(view, lane.x, lane.y)
     word = samples.number[lane.sample]
     row: Array | int = 0
@@ -449,7 +505,7 @@ def _advance(lane: Lane, plan: Plan, view: View, samples: FilmSamples, hits: Arr
         always,
         split,
         view.cutoff,
-        view.one,
+        None,
         differentiable=False,
     )
     return lane._replace(path=bounce(lane.path, setting))
