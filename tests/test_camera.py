@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from diffdisp.camera import Camera, camera_ray
+from diffdisp.camera import Camera, camera_ray, project
 
 WIDTH, HEIGHT, FOV = 12, 8, 40.0
 HALF = np.tan(np.radians(FOV / 2))
@@ -12,8 +12,8 @@ HALF = np.tan(np.radians(FOV / 2))
 @jax.jit
 def ray(camera, x, y):
     """Origin and direction (3,) of the ray through a film point."""
-    middle = jnp.array(WIDTH / 2), jnp.array(HEIGHT / 2)
-    found = camera_ray(camera, jnp.array(float(HEIGHT)), x, y, middle)
+    size = jnp.array(float(WIDTH)), jnp.array(float(HEIGHT))
+    found = camera_ray(project(camera, *size), x, y)
     return jnp.stack(found.origin), jnp.stack(found.direction)
 
 

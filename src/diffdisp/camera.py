@@ -1,12 +1,13 @@
 """From a point of the film to a ray."""
 
+from typing import NamedTuple
+
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
 from diffdisp.dispersion import real_array
 from diffdisp.geometry import Ray
-from diffdisp.vector import Real, Triple, normalize, vec3
+from diffdisp.vector import Real, Triple, Vec3, module_of, normalize, vec3
 
 
 class Camera(eqx.Module):
@@ -25,19 +26,46 @@ class Camera(eqx.Module):
     vertical_fov: Real = eqx.field(default=45.0, converter=real_array)
 
 
-def camera_ray(camera: Camera, height: Real, x: Real, y: Real, middle: tuple[Real, Real]) -> Ray:
-    """The ray through a point of the film.
+class Projection(NamedTuple):
+    """How a camera sees a picture: a plane at a distance of 1 before its pinhole.
 
     Args:
-        camera: the camera.
-        height: rows of the picture, over which the vertical field of view spreads.
-        x: pixels to the right of the picture's left edge.
-        y: pixels below its upper edge.
-        middle: the picture's middle (x, y) in the same pixels.
+        pinhole: scene units.
+        forward: unit vector to the plane.
+        right: one pixel of the picture, on the plane.
+        down: one pixel of the picture, on the plane.
+        middle: pixels from the picture's left and upper edges to where `forward` points.
+    """
+
+    pinhole: Vec3
+    forward: Vec3
+    right: Vec3
+    down: Vec3
+    middle: tuple[Real, Real]
+
+
+def project(camera: Camera, width: Real, height: Real) -> Projection:
+    """How the camera sees a picture of so many pixels; by NumPy if it holds NumPy's arrays.
+
+    The vertical field of view spreads over the picture's height.
     """
     forward = normalize(vec3(camera.look_at) - vec3(camera.look_from))
     right = normalize(forward.cross(vec3(camera.up)))
-    upward = right.cross(forward)
-    pixel = jnp.tan(camera.vertical_fov * (np.pi / 360.0)) * (2.0 / height)
-    direction = forward + right * ((x - middle[0]) * pixel) + upward * ((middle[1] - y) * pixel)
-    return Ray(vec3(camera.look_from), normalize(direction))
+    half = camera.vertical_fov * (np.pi / 360.0)
+    pixel = module_of(half).tan(half) * (2.0 / height)
+    down = forward.cross(right) * pixel
+    middle = (0.5 * width, 0.5 * height)
+    return Projection(vec3(camera.look_from), forward, right * pixel, down, middle)
+
+
+def camera_ray(projection: Projection, x: Real, y: Real) -> Ray:
+    """The ray through a point of the film.
+
+    Args:
+        projection: the camera and the picture's size.
+        x: pixels to the right of the picture's left edge.
+        y: pixels below its upper edge.
+    """
+    pinhole, forward, right, down, middle = projection
+    direction = forward + right * (x - middle[0]) + down * (y - middle[1])
+    return Ray(pinhole, normalize(direction))

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from diffdisp.camera import project
 from diffdisp.color import albedo_basis, wavelength_strata
 from diffdisp.dispersion import domain_error
 from diffdisp.film import Film
@@ -20,7 +21,7 @@ from diffdisp.planning import Plan
 from diffdisp.programs import OPTIONS
 from diffdisp.sampling import Numbers, sample_grid
 from diffdisp.scene import Scene, is_glass, object_glass
-from diffdisp.vector import Array, Real
+from diffdisp.vector import Array, Real, module_of
 
 COLOR_RANGE = (0.38, 0.78)
 """Wavelengths that a colour picture is made of, µm."""
@@ -357,9 +358,7 @@ def chunk_lanes(
         world_tables(scene),
         film_paint(plan, scene, spectrum),
         spectrum.weights,
-        scene.camera,
-        size[1],
-        (0.5 * size[0], 0.5 * size[1]),
+        project(scene.camera, *size),
         (pixels.size * run.cell[0], pixels.size * run.cell[1]),
         pixels.x[None, :] + place(run.right, 0),
         pixels.y[None, :] + place(run.down, 1),
@@ -381,12 +380,13 @@ def film_paint(plan: Plan, scene: Scene, spectrum: Spectrum) -> Paint:
     waves = spectrum.wavelengths.shape[0]
 
     def seen(channels: tuple[Array, ...]) -> tuple[Array, ...]:
-        table: Array = jnp.stack(channels)
+        both = module_of(*channels)
+        table: Array = both.stack(channels)
         if basis is not None and (plan.dispersive or plan.scattering):
             table = basis @ table
         if plan.channels == 1:
             return (table,)
-        return tuple(jnp.broadcast_to(row, (waves, row.shape[0])) for row in table)
+        return tuple(both.broadcast_to(row, (waves, row.shape[0])) for row in table)
 
     return paint._replace(mean=seen(paint.mean), half=seen(paint.half))
 

@@ -1,12 +1,14 @@
 """How the index of a glass depends on the wavelength."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from diffdisp.vector import Real, Triple
+from diffdisp.vector import Real, Triple, module_of
 
 LINE_D = 0.5875618
 """Helium d line, µm. Source: Schott TIE-29 (2016), table 1."""
@@ -47,17 +49,21 @@ class Sellmeier(eqx.Module):
         Source:
             Hartmann, Optical Glass (SPIE Press, 2014), eq. 3.12.
         """
+        return jnp.sqrt(self._squared_index(wavelength))
+
+    def _squared_index(self, wavelength: Any) -> Any:
         squared = wavelength * wavelength
         # Term by term: the tracer calls this for one glass at a time, and C = 0 with B = 0 is a
         # vacuum bubble, whose term must vanish at every wavelength.
         terms = [self.B[i] * squared / (squared - self.C[i]) for i in range(3)]
-        return jnp.sqrt(1.0 + (terms[0] + (terms[1] + terms[2])))
+        return 1.0 + (terms[0] + (terms[1] + terms[2]))
 
     def indices(
         self, wavelengths: Float[jax.Array | np.ndarray, " k"]
     ) -> Float[jax.Array | np.ndarray, " k"]:
         """`refractive_index` at each of `wavelengths` (K,), µm."""
-        return jax.vmap(self.refractive_index)(jnp.asarray(wavelengths))
+        squared = self._squared_index(wavelengths)
+        return module_of(squared).sqrt(squared)
 
     @property
     def n_d(self) -> Real:

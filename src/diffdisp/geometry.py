@@ -97,10 +97,9 @@ def plane_axes(normal: Vec3) -> tuple[Vec3, Vec3]:
 
     u = (0, 1, 0) × normal, normalised, or (1, 0, 0) where the normal is along y; v = normal × u.
     """
-    length = jnp.sqrt(normal.dot(normal))
-    unit = normal * (1.0 / length)
-    zero = jnp.zeros_like(unit.x)
+    unit = normalize(normal)
+    zero = unit.x * 0.0
     upright = (unit.x == 0) & (unit.z == 0)
-    across = Vec3(jnp.where(upright, 1.0, unit.z), zero, jnp.where(upright, 0.0, -unit.x))
+    across = choose(upright, Vec3(zero + 1.0, zero, zero), Vec3(unit.z, zero, -unit.x))
     u = choose(upright, Vec3(zero + 1.0, zero, zero), normalize(across))
     return u, unit.cross(u)

@@ -17,7 +17,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero, zero_from_primal
 from jaxtyping import Bool, Float, Int
 
-from diffdisp.camera import Camera, camera_ray
+from diffdisp.camera import Projection, camera_ray
 from diffdisp.fresnel import cos_transmitted, fresnel_reflectance, reflection, refraction
 from diffdisp.geometry import (
     Plane,
@@ -33,7 +33,7 @@ from diffdisp.planning import Plan
 from diffdisp.sampling import Numbers, uniform_direction
 from diffdisp.scene import Object, Scene, is_glass, texture_of
 from diffdisp.texture import Checker, Solid, filtered_square_wave
-from diffdisp.vector import Array, Real, Vec3, choose, normalize, vec3
+from diffdisp.vector import Array, Real, Vec3, choose, module_of, normalize, vec3
 
 
 class World(NamedTuple):
@@ -100,32 +100,33 @@ def surfaces_of(scene: Scene) -> list[Object]:
 
 
 def world_tables(scene: Scene) -> World:
-    """The scene's geometry as tables."""
+    """The scene's geometry as tables, by NumPy if the scene holds its arrays."""
     surfaces = surfaces_of(scene)
     spheres = [obj.shape for obj in surfaces if isinstance(obj.shape, Sphere)]
     planes = [obj.shape for obj in surfaces if isinstance(obj.shape, Plane)]
-    normals = _table([normalize(vec3(p.normal)) for p in planes])
+    normals = [normalize(vec3(p.normal)) for p in planes]
+    axes = [plane_axes(normal) for normal in normals]
     return World(
         _table([vec3(s.center) for s in spheres]),
         _row([s.radius for s in spheres]),
         _table([vec3(p.point) for p in planes]),
-        normals,
-        jax.vmap(plane_axes)(normals),
+        _table(normals),
+        (_table([u for u, _ in axes]), _table([v for _, v in axes])),
         _row([obj.material.fuzz for obj in surfaces if isinstance(obj.material, Metal)]),
     )
 
 
 def paint_table(scene: Scene) -> Paint:
-    """What the scene's surfaces and its background show, in linear sRGB."""
-    zero = jnp.zeros_like(scene.camera.vertical_fov)
+    """What the scene's surfaces and its background show, in linear sRGB; as `world_tables`."""
+    color = scene.background.color
+    zero = 0.0 * color[0]
     rows = [_even_odd_scale(obj.material, zero) for obj in surfaces_of(scene) if not is_glass(obj)]
-    color = jnp.asarray(scene.background.color)
     rows.append((color, color, zero, False))
-    even, odd = (jnp.stack([row[i] for row in rows], axis=-1) for i in (0, 1))
+    even, odd = (_row([row[i] for row in rows]).T for i in (0, 1))
     return Paint(
         tuple(0.5 * (even + odd)),
         tuple(0.5 * (even - odd)),
-        jnp.stack([row[2] for row in rows]),
+        _row([row[2] for row in rows]),
         np.array([row[3] for row in rows]),
     )
 
@@ -136,15 +137,15 @@ def _even_odd_scale(material: Material, zero: Real) -> tuple[Array, Array, Real,
     assert texture is not None
     factor = material.intensity if isinstance(material, Emitter) else zero + 1.0
     if isinstance(texture, Solid):
-        color = jnp.asarray(texture.color) * factor
+        color = texture.color * factor
         return color, color, zero, False
     scale = texture.scale / np.pi if isinstance(texture, Checker) else 1.0 / texture.tile
-    even, odd = (jnp.asarray(c) * factor for c in (texture.even, texture.odd))
-    return even, odd, jnp.asarray(scale), isinstance(texture, Checker)
+    even, odd = (color * factor for color in (texture.even, texture.odd))
+    return even, odd, scale, isinstance(texture, Checker)
 
 
-def _row(values: list[Real]) -> Float[Array, " rows"]:
-    return jnp.stack([jnp.asarray(v) for v in values]) if values else jnp.zeros(0)
+def _row(values: list[Any]) -> Any:
+    return module_of(*values).stack(values) if values else np.zeros(0)
 
 
 def _table(vectors: list[Vec3]) -> Vec3:
@@ -442,30 +443,26 @@ class Tables(NamedTuple):
 
 
 def start_path(
-    camera: Camera,
+    projection: Projection,
     tables: Tables,
     plan: Plan,
-    height: Real,
     film_point: tuple[Real, Real],
-    middle: tuple[Real, Real],
     cell: tuple[Real, Real],
     one: Array | None,
 ) -> Path:
     """The path from a film point to its first surface; ended, unless that one sends it on.
 
     Args:
-        camera: the camera.
+        projection: the camera and the picture's size.
         tables: the scene.
         plan: its static choices.
-        height: rows of the picture.
         film_point: pixels to the right of and below the picture's upper left corner.
-        middle: the picture's middle, in the same pixels.
         cell: width and height of the part of the film that the sample stands for, pixels.
         one: as in `once`.
     """
 
     def through(x: Real, y: Real) -> Ray:
-        return camera_ray(camera, height, x, y, middle)
+        return camera_ray(projection, x, y)
 
     zero = jnp.zeros_like(film_point[0])
     if plan.scattering:
@@ -1198,9 +1195,7 @@ class Lanes(NamedTuple):
     world: World
     paint: Paint
     weights: Float[Array, "wavelengths samples channels"] | None
-    camera: Camera
-    height: Real
-    middle: tuple[Real, Real]
+    projection: Projection
     cell: tuple[Real, Real]
     x: Float[Array, "samples pixels"]
     y: Float[Array, "samples pixels"]
@@ -1281,7 +1276,6 @@ Loop = Callable[[Step | None, Step, Path, Plan], Path]
 
 def _radiance(plan: Plan, indices: tuple[Array, ...], lanes: Lanes, loop: Loop) -> Array:
     """`lane_radiance`, with the loop that the wanted derivative allows."""
-    middle, cell = lanes.middle, lanes.cell
     waves, rows = lanes.paint.mean[0].shape
     # The rows of all wavelengths in one table.
     mean, half = (tuple(c.reshape(-1) for c in part) for part in lanes.paint[:2])
@@ -1290,7 +1284,7 @@ def _radiance(plan: Plan, indices: tuple[Array, ...], lanes: Lanes, loop: Loop) 
 
     def start(x: Real, y: Real, first_row: Array) -> Path:
         seen = tables._replace(first_row=first_row)
-        return start_path(lanes.camera, seen, plan, lanes.height, (x, y), middle, cell, lanes.one)
+        return start_path(lanes.projection, seen, plan, (x, y), lanes.cell, lanes.one)
 
     every = jax.vmap(jax.vmap(jax.vmap(start, (0, 0, None)), (0, 0, None)), (None, None, 0))
     paths = every(lanes.x, lanes.y, first_rows)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from diffdisp.camera import project
 from diffdisp.chunks import (
     WAVES_OF_ANY_PATH,
     RunNumbers,
@@ -21,7 +22,6 @@ from diffdisp.chunks import (
     film_size,
     film_spectrum,
     glass_indices,
-    in_dtype,
     in_threads,
     over_chunks,
     parts_of,
@@ -34,11 +34,10 @@ from diffdisp.chunks import (
 )
 from diffdisp.color import wavelength_strata
 from diffdisp.film import Film
-from diffdisp.integrator import Tables, world_tables
+from diffdisp.integrator import world_tables
 from diffdisp.planning import Plan, make_plan
 from diffdisp.programs import Program, program
 from diffdisp.scene import Scene, without_names
-from diffdisp.vector import Real
 from diffdisp.wavefront import (
     MOST_SAMPLES,
     FilmSamples,
@@ -262,76 +261,63 @@ class _Call(NamedTuple):
 
 
 def _calls(work: _Work, film: Film, spectrum: Spectrum, run: RunNumbers) -> list[_Call]:
-    """The calls of the compiled program that make a pass."""
+    """The calls of the compiled program that make a pass: one for each part, and for each band."""
     assert work.tiles is not None
     bands, channels = [spectrum], [slice(None)]
     if work.plan.dispersive and spectrum.basis is not None:
         pairs = zip(np.asarray(spectrum.wavelengths), np.asarray(spectrum.basis), strict=True)
         bands = [Spectrum(wavelength[None], basis[None], None) for wavelength, basis in pairs]
         channels = [slice(band, band + 1) for band in range(len(bands))]
+    scene, size = plain(work.scene, "float64"), film_size(film)
+    world, projection = world_tables(scene), project(scene.camera, *size)
+    width, height = (edge.astype(np.int32) for edge in size)
     calls = []
     for band, fills in zip(bands, channels, strict=True):
-        fixed = plain((work.scene, band, film_size(film), run), work.plan.dtype)
+        paint = film_paint(work.plan, scene, band)
+        mean, half = (tuple(channel[0] for channel in part) for part in paint[:2])
+        paint = paint._replace(mean=mean, half=half)
+        view = View(world, paint, projection, width, height, run.seed, run.cutoff)
+        fixed = plain((view, _film_samples(work.plan, scene, band, run)), work.plan.dtype)
         calls += [_Call((*fixed, part), fills) for part in work.tiles]
     return calls
+
+
+def _film_samples(plan: Plan, scene: Scene, spectrum: Spectrum, run: RunNumbers) -> FilmSamples:
+    """The samples of every pixel of a scene that holds NumPy's arrays."""
+    indices = glass_indices(scene, np.atleast_2d(spectrum.wavelengths))
+    weights = ratios = None
+    if spectrum.weights is not None:
+        ratios = _channel_ratios(scene, np.asarray(spectrum.wavelengths)[0, :1])
+        weights = tuple(np.asarray(spectrum.weights).T * plan.samples)
+    return FilmSamples(
+        run.number,
+        run.right,
+        run.down,
+        run.cell,
+        np.stack(indices, axis=-1).swapaxes(0, 1) if indices else np.zeros((1, 1, 0)),
+        weights,
+        ratios,
+    )
+
+
+def _channel_ratios(scene: Scene, middle: np.ndarray) -> tuple[np.ndarray, ...]:
+    """For each channel, each ball's mean index over what the channel sees, over the middle one."""
+    wavelengths, weights = wavelength_strata(64)
+    seen, one = (np.stack(glass_indices(scene, at)) for at in (wavelengths, middle))
+    return tuple((seen @ weights / one).T)
 
 
 def _trace_program(plan: Plan, arguments: tuple[Any, ...]) -> Program:
     """The compiled program of the wavefront loop."""
     with jax.enable_x64(plan.dtype == "float64"):
         edge = tile_edge(plan.samples)
-        return program(trace_picture, (plan, edge, lanes_for(arguments[-1], edge)), arguments)
+        return program(trace_tiles, (plan, edge, lanes_for(arguments[-1], edge)), arguments)
 
 
 def _background(scene: Scene, spectrum: Spectrum) -> np.ndarray:
     """The background in the film's channels."""
     color = np.asarray(scene.background.color)
     return color if spectrum.basis is None else np.asarray(spectrum.basis) @ color
-
-
-def trace_picture(
-    plan: Plan,
-    edge: int,
-    lanes: int,
-    scene: Scene,
-    spectrum: Spectrum,
-    size: tuple[Real, Real],
-    run: RunNumbers,
-    tiles: Tiles,
-) -> jax.Array:
-    """Mean radiance (tiles, pixels, channels) of some tiles."""
-    scene, spectrum, size, run = in_dtype((scene, spectrum, size, run), plan.dtype)
-    paint = film_paint(plan, scene, spectrum)
-    paint = paint._replace(
-        mean=tuple(channel[0] for channel in paint.mean),
-        half=tuple(channel[0] for channel in paint.half),
-    )
-    indices = glass_indices(scene, jnp.atleast_2d(spectrum.wavelengths))
-    weights = ratios = None
-    if spectrum.weights is not None:
-        ratios = _channel_ratios(scene, spectrum.wavelengths[0, 0])
-        weights = tuple(jnp.moveaxis(spectrum.weights, (2, 1, 0), (0, 1, 2)) * plan.samples)
-    samples = FilmSamples(
-        run.number,
-        run.right,
-        run.down,
-        run.cell,
-        jnp.stack(indices, axis=-1).swapaxes(0, 1) if indices else jnp.zeros((1, 1, 0)),
-        weights,
-        ratios,
-    )
-    width, height = (edge.astype(jnp.int32) for edge in size)
-    tables = Tables(world_tables(scene), paint)
-    view = View(tables, scene.camera, width, height, run.seed, run.cutoff)
-    return trace_tiles(plan, edge, lanes, view, samples, tiles)
-
-
-def _channel_ratios(scene: Scene, middle: Real) -> tuple[jax.Array, ...]:
-    """For each channel, each ball's mean index over what the channel sees, over the middle one."""
-    wavelengths, weights = wavelength_strata(64)
-    seen = jnp.stack(glass_indices(scene, jnp.asarray(wavelengths, middle.dtype)))
-    one = jnp.stack(glass_indices(scene, middle[None]))
-    return tuple((seen @ jnp.asarray(weights, middle.dtype) / one).T)
 
 
 def compile_ahead(scene: Scene, film: Film, *, samples: int, depth: int, dtype: str) -> None:

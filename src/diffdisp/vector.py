@@ -1,6 +1,6 @@
 """Vectors as three scalars, and roots whose gradients stay finite."""
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,10 @@ from jaxtyping import Float
 Array = jax.Array | np.ndarray
 """An array of JAX or of NumPy."""
 
-Real = Float[jax.Array | np.ndarray, ""]
+if TYPE_CHECKING:
+    Real = Array
+else:  # what NumPy computes of arrays of no axes are its own numbers
+    Real = Float[jax.Array | np.ndarray | np.floating, ""]
 """One real number; `vmap` makes many of it."""
 
 Triple = Float[jax.Array | np.ndarray, "3"]
@@ -62,12 +65,22 @@ def vec3(triple: Triple) -> Vec3:
     return Vec3(triple[0], triple[1], triple[2])
 
 
+def module_of(*values: object) -> Any:
+    """NumPy, or JAX's twin of it if any of the values is JAX's.
+
+    What no derivative is wanted of is laid out by NumPy: JAX would compile a program for it.
+    """
+    return jnp if any(isinstance(value, jax.Array) for value in values) else np
+
+
 def choose(condition: Array | bool, a: Any, b: Any) -> Any:
     """`a` where the condition holds, else `b`, leaf by leaf; known conditions cost nothing."""
     if isinstance(condition, bool):
         return a if condition else b
 
-    def either(p: Array, q: Array) -> Array:
+    def either(p: Array, q: Array) -> Any:
+        if module_of(condition, p, q) is np:
+            return np.where(condition, p, q)
         alike = jnp.shape(condition) == jnp.shape(p) == jnp.shape(q)
         if alike and jnp.result_type(p) == jnp.result_type(q):
             return jax.lax.select(condition, p, q)  # a tenth of the time to trace
@@ -93,4 +106,5 @@ def safe_sqrt(x: Real, above: Real | float = 0.0) -> Real:
 
 def normalize(v: Vec3) -> Vec3:
     """The unit vector along `v`; NaN for the zero vector, which has none."""
-    return v * (1.0 / jnp.sqrt(v.dot(v)))
+    squared = v.dot(v)
+    return v * (1.0 / module_of(squared).sqrt(squared))

@@ -13,15 +13,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int, UInt32
 
-from diffdisp.camera import Camera, camera_ray
+from diffdisp.camera import Camera, Projection, camera_ray
 from diffdisp.film import Film
 from diffdisp.geometry import Ray, Sphere
 from diffdisp.integrator import (
     Candidates,
+    Paint,
     Path,
     Setting,
     Split,
     Tables,
+    World,
     bounce,
     emitted,
     first_places,
@@ -105,8 +107,9 @@ class FilmSamples(NamedTuple):
 class View(NamedTuple):
     """A scene and a film, as the wavefront sees them; sizes in pixels."""
 
-    tables: Tables
-    camera: Camera
+    world: World
+    paint: Paint
+    projection: Projection
     width: Int[Array, ""]
     height: Int[Array, ""]
     seed: Array
@@ -302,13 +305,10 @@ def _sample_ray(plan: Plan, view: View, samples: FilmSamples, x: Array, y: Array
     numbers, pixel = _numbers(plan, view), _pixel_number(view, x, y)
     word = samples.number[s]
     across, down = once(lambda: tuple(numbers.of_film(pixel, word, axis) for axis in (0, 1)), None)
-    middle = (0.5 * view.width.astype(plan.dtype), 0.5 * view.height.astype(plan.dtype))
     return camera_ray(
-        view.camera,
-        view.height.astype(plan.dtype),
+        view.projection,
         x.astype(plan.dtype) + (samples.right[s] + across * samples.cell[0]),
         y.astype(plan.dtype) + (samples.down[s] + down * samples.cell[1]),
-        middle,
     )
 
 
@@ -332,7 +332,7 @@ def _first_hits(
     """
     size, capacity = edge * edge, tiles.x.shape[0]
     y, x = np.divmod(np.arange(size, dtype=np.int32), np.int32(edge))
-    world = view.tables.world
+    world, tables = view.world, Tables(view.world, view.paint)
     # A sphere of no size for the rows that only fill the groups.
     centers = Vec3(*(jnp.append(axis, 0.0) for axis in world.centers))
     radii = jnp.append(world.radii, 0.0)
@@ -354,7 +354,7 @@ def _first_hits(
             ray = once(lambda: _sample_ray(plan, view, samples, x, y, s))
             surface = nearest(ray, world, plan, no_surface(ray.origin.x), spheres)
             path = new_path(ray, None, surface, plan)
-            shown = emitted(surface, path, view.tables, plan, None)
+            shown = emitted(surface, path, tables, plan, None)
             ends = surface >= plan.first_lamp
             shown = tuple(jnp.where(ends, channel, 0.0) for channel in shown)
             return shown, jnp.where(path.alive, surface, -1)
@@ -497,7 +497,7 @@ def _advance(lane: Lane, plan: Plan, view: View, samples: FilmSamples, hits: Arr
             tuple(look_up(ratio, ball) for ratio in samples.ratios),
         )
     setting = Setting(
-        view.tables,
+        Tables(view.world, view.paint),
         plan,
         lambda bounces, decision: numbers.of_bounce(pixel, word, bounces, decision),
         lambda ball: look_up(samples.indices, row, wave, ball),
