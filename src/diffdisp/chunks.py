@@ -434,7 +434,7 @@ def each_chunk(chunk: Callable[[Pixels], Array], chunks: Pixels) -> jax.Array:
 def plain(tree: Any, dtype: str) -> Any:
     """The tree as NumPy's arrays, its real numbers in `dtype`: as a compiled program takes them."""
 
-    def cast(leaf: jax.Array | np.ndarray) -> np.ndarray:
+    def cast(leaf: Array) -> np.ndarray:
         array = np.asarray(leaf)
         return array.astype(dtype) if np.issubdtype(array.dtype, np.floating) else array
 

@@ -134,15 +134,17 @@ def render_progressively(
     dtype = dtype or jnp.result_type(float).name
     check_glasses(scene, *film_range(film))
     work = _lay_out(scene, film, samples, depth, dtype)
-    total, passes = np.zeros((film.height, film.width, film.channels), dtype), len(work.cells)
+    total, passes = np.zeros((), dtype), len(work.cells)
     for number in range(passes):
 
         def tell(done: int, of: int, number: int = number) -> None:
             if progress:
                 progress(number * of + done, passes * of)
 
-        total += _one_pass(work, film, seed, number, tell)
-        yield Growing(total / (number + 1), (number + 1) * work.plan.samples)
+        shown = _one_pass(work, film, seed, number, tell)
+        total = total + shown if number else shown
+        mean = total / (number + 1) if number else total
+        yield Growing(mean, (number + 1) * work.plan.samples)
 
 
 def _picture(
@@ -162,7 +164,7 @@ class _Work(NamedTuple):
 
     Args:
         plan: of one pass.
-        scene: without names.
+        scene: without names, which would make another program of the direct loop.
         spectrum: of the samples of all passes.
         cells: (passes, samples) of the film, the samples' numbers.
         tiles: what the wavefront goes through, in parts; None for the direct loop.
@@ -194,7 +196,8 @@ def _lay_out(scene: Scene, film: Film, samples: int, depth: int, dtype: str) -> 
             plan = replace(plan, bands=1)
         tiles = visible_tiles(scene, film, plan, tile_edge(share), workers())
         spectrum = with_split_paths(spectrum, whole)
-    return _Work(plan, without_names(scene), spectrum, cells.reshape(-1, share), tiles)
+    nameless = scene if plan.scattering else without_names(scene)
+    return _Work(plan, nameless, spectrum, cells.reshape(-1, share), tiles)
 
 
 def _one_pass(
@@ -250,7 +253,7 @@ def _wavefront_pass(
         trace = _trace_program(plan, calls[0].arguments)
         in_threads(one, calls, plan.dtype, progress, alone=0)
     whole = picture.reshape(rows * edge, columns * edge, film.channels)
-    return whole[: film.height, : film.width]
+    return np.ascontiguousarray(whole[: film.height, : film.width])
 
 
 class _Call(NamedTuple):

@@ -7,16 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-Array = jax.Array | np.ndarray
+if TYPE_CHECKING:
+    Array = jax.Array | np.ndarray
+else:  # what NumPy computes of arrays without axes are numbers of its own
+    Array = jax.Array | np.ndarray | np.generic
 """An array of JAX or of NumPy."""
 
-if TYPE_CHECKING:
-    Real = Array
-else:  # what NumPy computes of arrays of no axes are its own numbers
-    Real = Float[jax.Array | np.ndarray | np.floating, ""]
+Real = Float[Array, ""]
 """One real number; `vmap` makes many of it."""
 
-Triple = Float[jax.Array | np.ndarray, "3"]
+Triple = Float[Array, "3"]
 """Three numbers as data holds them: a point, a direction or a colour."""
 
 
