@@ -243,8 +243,8 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 class Queue(NamedTuple):
     """Pixels of which samples go on, those that have most to do before the others.
 
-    Where a scene has glass there are two rows: those with samples that meet it, and the others.
-    Paths through glass are the longest, and the last one is waited for by all lanes.
+    Where a scene has glass or metal balls there are two rows: those with samples that meet any, and
+    the others. Such paths are the longest, and the last one is waited for by all lanes.
 
     Args:
         pixels: their numbers, from the start of each row.
@@ -369,9 +369,9 @@ def _first_hits(
         goes_on = (surface >= 0) & inside[:, None]
         waiting = jnp.sum(jnp.where(goes_on, bits, np.uint32(0)), axis=-1, dtype=jnp.uint32)
         kinds: list[Array] = [waiting != 0]
-        if plan.balls:
-            at_glass = jnp.any(goes_on & (surface < plan.balls), axis=-1)
-            kinds = [at_glass, kinds[0] & ~at_glass]
+        if plan.mattes[0]:
+            shiny = jnp.any(goes_on & (surface < plan.mattes[0]), axis=-1)
+            kinds = [shiny, kinds[0] & ~shiny]
         seen = tuple(jnp.sum(channel, axis=-1) for channel in shown)
         return seen, waiting, surface.reshape(-1), kinds
 
@@ -388,7 +388,7 @@ def _first_hits(
         jnp.zeros(capacity * size, jnp.uint32),
         jnp.zeros(capacity * size * plan.samples, jnp.int32),
     )
-    rows = 2 if plan.balls else 1
+    rows = 2 if plan.mattes[0] else 1
     nobody = Queue(jnp.zeros((rows, (capacity + 1) * size), jnp.int32), jnp.zeros(rows, jnp.int32))
     (shown, waiting, hits), queue = jax.lax.fori_loop(0, tiles.filled, put, (empty, nobody))
     return list(shown), waiting, hits, queue
