@@ -60,6 +60,9 @@ PIXELS = 1 << 17
 STRIPS = 16
 """Strips of a picture, at least, that are dealt out to its parts."""
 
+SHARES = 2
+"""Lanes that share a pixel of long paths, which a small picture would wait for."""
+
 
 class Tiles(NamedTuple):
     """Square tiles of a picture to render, and what each can see.
@@ -241,44 +244,32 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 
 class Queue(NamedTuple):
-    """Pixels of which samples go on, those that have most to do before the others.
+    """What waits for a lane, the longest first: all lanes have to wait for the last path.
 
-    Where a scene has glass or metal balls there are two rows: those with samples that meet any, and
-    the others. Such paths are the longest, and the last one is waited for by all lanes.
+    The longest paths are those of pixels that see balls of glass or metal. They are shared out to
+    several lanes, and come before all others. What waits is told by its slot: a share of a pixel.
 
     Args:
-        pixels: their numbers, from the start of each row.
-        lengths: how many of a row count.
+        slots: of such pixels, and of the others; of each those that wait first.
+        lengths: how many of them wait.
     """
 
-    pixels: Int[Array, "rows places"]
-    lengths: Int[Array, " rows"]
+    slots: tuple[Int[Array, " places"], ...]
+    lengths: tuple[Int[Array, ""], ...]
 
-    def longer(self, first: Array, kinds: list[Array]) -> "Queue":
-        """The queue with some of the pixels of a tile.
-
-        Args:
-            first: the tile's first pixel.
-            kinds: for each row, whether the tile's pixels belong there.
-        """
-        pixels = self.pixels
-        for row, chosen in enumerate(kinds):
-            # The tile writes to as many places as it has pixels; the next takes those left over.
-            places = np.int32(row), self.lengths[row]
-            part = (first + first_places(chosen))[None]
-            pixels = jax.lax.dynamic_update_slice(pixels, part, places)
-        counts = [jnp.sum(chosen, dtype=jnp.int32) for chosen in kinds]
-        return Queue(pixels, self.lengths + jnp.stack(counts))
+    @property
+    def length(self) -> Array:
+        """How many slots wait."""
+        return self.lengths[0] + self.lengths[1]
 
     def at(self, place: Array) -> Array:
-        """The pixels at some places, which may be past the end."""
-        last = self.pixels.shape[1] - 1
-        row: Array = jnp.zeros_like(place)
-        column = place
-        if self.lengths.shape[0] > 1:
-            row = (place >= self.lengths[0]).astype(jnp.int32)
-            column = place - row * self.lengths[0]
-        return look_up(self.pixels, row, jnp.minimum(column, last))
+        """The slots at some places, which may be past the end."""
+        places = place, place - self.lengths[0]
+        shared, whole = (
+            look_up(slots, jnp.clip(at, 0, slots.shape[0] - 1))
+            for slots, at in zip(self.slots, places, strict=True)
+        )
+        return jnp.where(place < self.lengths[0], shared, whole)
 
 
 def trace_tiles(
@@ -296,7 +287,11 @@ def trace_tiles(
     """
     shown, waiting, hits, queue = _first_hits(plan, edge, view, samples, tiles)
     collected = _follow(plan, edge, lanes, view, samples, tiles, waiting, hits, queue)
-    total = [s + c[:-1] for s, c in zip(shown, collected, strict=True)]
+    pixels = waiting.shape[0]
+    total = [
+        s + jnp.sum(c[:-1].reshape(-1, pixels), axis=0)
+        for s, c in zip(shown, collected, strict=True)
+    ]
     return jnp.stack(total, axis=-1).reshape(-1, edge * edge, len(total)) * (1.0 / plan.samples)
 
 
@@ -331,6 +326,7 @@ def _first_hits(
         the pixels with samples that go on.
     """
     size, capacity = edge * edge, tiles.x.shape[0]
+    pixels = capacity * size
     y, x = np.divmod(np.arange(size, dtype=np.int32), np.int32(edge))
     world, tables = view.world, Tables(view.world, view.paint)
     # A sphere of no size for the rows that only fill the groups.
@@ -338,7 +334,7 @@ def _first_hits(
     radii = jnp.append(world.radii, 0.0)
     numbers = jnp.asarray(np.append(surface_numbers(plan)[0], np.int32(0)))
 
-    def see(tile: Array) -> tuple[tuple[Array, ...], Array, Array, list[Array]]:
+    def see(tile: Array) -> tuple[tuple[Array, ...], Array, Array, Array]:
         rows = tiles.candidates[tile]
         spheres = Candidates(
             Vec3(*(axis[rows] for axis in centers)),
@@ -368,30 +364,46 @@ def _first_hits(
         bits = np.uint32(1) << np.arange(plan.samples, dtype=np.uint32)
         goes_on = (surface >= 0) & inside[:, None]
         waiting = jnp.sum(jnp.where(goes_on, bits, np.uint32(0)), axis=-1, dtype=jnp.uint32)
-        kinds: list[Array] = [waiting != 0]
-        if plan.mattes[0]:
-            shiny = jnp.any(goes_on & (surface < plan.mattes[0]), axis=-1)
-            kinds = [shiny, kinds[0] & ~shiny]
+        shiny = jnp.any(goes_on & (surface < plan.mattes[0]), axis=-1)
         seen = tuple(jnp.sum(channel, axis=-1) for channel in shown)
-        return seen, waiting, surface.reshape(-1), kinds
+        return seen, waiting, surface.reshape(-1), shiny
 
     def put(tile: Array, state: Any) -> Any:
         def at(whole: Array, part: Array) -> Array:
             return jax.lax.dynamic_update_slice(whole, part, (tile * part.shape[0],))
 
         results, queue = state
-        *found, kinds = see(tile)
-        return jax.tree.map(at, results, tuple(found)), queue.longer(tile * size, kinds)
+        *found, shiny = see(tile)
+        waiting, slots, lengths = found[1], list(queue.slots), list(queue.lengths)
+        for share, mask in enumerate(_shares(plan)):
+            row = int(share == 0)
+            chosen = ((waiting & mask) != 0) & (shiny if share else ~shiny)
+            # All of a tile's pixels are written; the next ones take the places of those that do
+            # not wait.
+            part = first_places(chosen) + (share * pixels + tile * size)
+            slots[row] = jax.lax.dynamic_update_slice(slots[row], part, (lengths[row],))
+            lengths[row] = lengths[row] + jnp.sum(chosen, dtype=jnp.int32)
+        queue = Queue(tuple(slots), tuple(lengths))
+        return jax.tree.map(at, results, tuple(found)), queue
 
     empty = (
         tuple(jnp.zeros(capacity * size, plan.dtype) for _ in range(plan.channels)),
         jnp.zeros(capacity * size, jnp.uint32),
         jnp.zeros(capacity * size * plan.samples, jnp.int32),
     )
-    rows = 2 if plan.mattes[0] else 1
-    nobody = Queue(jnp.zeros((rows, (capacity + 1) * size), jnp.int32), jnp.zeros(rows, jnp.int32))
+    none = jnp.zeros((), jnp.int32)
+    rows = (len(_shares(plan)) - 1) * pixels + size, pixels + size
+    nobody = Queue(tuple(jnp.zeros(row, jnp.int32) for row in rows), (none, none))
     (shown, waiting, hits), queue = jax.lax.fori_loop(0, tiles.filled, put, (empty, nobody))
     return list(shown), waiting, hits, queue
+
+
+def _shares(plan: Plan) -> np.ndarray:
+    """Bits of a pixel's samples: of all, and of each share where pixels are shared out."""
+    masks = [(1 << plan.samples) - 1]
+    shares = min(SHARES, plan.samples) if plan.mattes[0] else 0
+    masks += [sum(1 << k for k in range(n, plan.samples, shares)) for n in range(shares)]
+    return np.array(masks, np.uint32)
 
 
 def _follow(
@@ -406,15 +418,16 @@ def _follow(
     queue: Queue,
 ) -> tuple[Array, ...]:
     """The sum of each pixel's samples that went on, a channel each, with a place to spare."""
-    pixels, waves = waiting.shape[0], samples.indices.shape[1]
-    length = jnp.sum(queue.lengths, dtype=jnp.int32)
+    pixels, waves, length = waiting.shape[0], samples.indices.shape[1], queue.length
+    shares = _shares(plan)
+    sink = len(shares) * pixels
     advance = jax.vmap(lambda lane: _advance(lane, plan, view, samples, hits))
 
     def busy(lane: Lane) -> Array:
         return lane.path.alive | (lane.waiting != 0) | _splits(lane, waves)
 
     def collect(lane: Lane, results: tuple[Array, ...]) -> tuple[Array, ...]:
-        slot = jnp.where(busy(lane), pixels, lane.slot)
+        slot = jnp.where(busy(lane), sink, lane.slot)
         pairs = zip(results, lane.path.radiance, strict=True)
         return tuple(jnp.asarray(whole).at[slot].set(value) for whole, value in pairs)
 
@@ -423,16 +436,17 @@ def _follow(
         place = taken + jnp.cumsum(idle, dtype=jnp.int32) - 1
         fresh = idle & (place < length)
         slot = queue.at(place)
-        tile, pixel = slot // (edge * edge), slot % (edge * edge)
+        share, number = slot // pixels, slot % pixels
+        tile, pixel = number // (edge * edge), number % (edge * edge)
         renewed = lane._replace(
             slot=slot,
             x=tiles.x[tile] + pixel % edge,
             y=tiles.y[tile] + pixel // edge,
-            waiting=waiting[slot],
+            waiting=waiting[number] & look_up(shares, share),
             path=lane.path._replace(radiance=tuple(jnp.zeros_like(r) for r in lane.path.radiance)),
         )
         # What idles for good writes its result once more, to a place that nobody reads.
-        rested = lane._replace(slot=jnp.where(idle, pixels, lane.slot))
+        rested = lane._replace(slot=jnp.where(idle, sink, lane.slot))
         taken = jnp.minimum(taken + jnp.sum(idle, dtype=jnp.int32), length)
         return choose(fresh, renewed, rested), taken
 
@@ -449,16 +463,16 @@ def _follow(
     def unfinished(state: Any) -> Array:
         return (state[2] < length) | jnp.any(busy(state[0]))
 
-    results = tuple(jnp.zeros(pixels + 1, plan.dtype) for _ in range(plan.channels))
+    results = tuple(jnp.zeros(sink + 1, plan.dtype) for _ in range(plan.channels))
     none = jnp.zeros((), jnp.int32)
     lane, results, _ = jax.lax.while_loop(
-        unfinished, turn, (_idle_lanes(plan, lanes, pixels, view), results, none)
+        unfinished, turn, (_idle_lanes(plan, lanes, sink, view), results, none)
     )
     return collect(lane, results)
 
 
 def _idle_lanes(plan: Plan, lanes: int, sink: int, view: View) -> Lane:
-    """Lanes without a pixel."""
+    """Lanes without a pixel, as if they had followed the last wavelength of a sample."""
     zero, real = jnp.zeros((), jnp.int32), jnp.zeros((), plan.dtype)
     still = vec3(jnp.zeros(3, plan.dtype))
     path = new_path(Ray(still, still._replace(z=real - 1.0)), None, zero + plan.background, plan)
@@ -468,8 +482,8 @@ def _idle_lanes(plan: Plan, lanes: int, sink: int, view: View) -> Lane:
         zero,
         jnp.zeros((), jnp.uint32),
         zero,
-        None if path.spectral is None or plan.bands else zero,
-        None if path.spectral is None or plan.bands else zero,
+        None if path.spectral is None or plan.bands else zero + 1,
+        None if path.spectral is None or plan.bands else zero + NO_GLASS,
         path,
     )
     return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (lanes, *leaf.shape)), lane)
@@ -532,7 +546,8 @@ def _next_sample(lane: Lane, plan: Plan, view: View, samples: FilmSamples, hits:
     following = jax.lax.population_count(lowest - np.uint32(1)).astype(jnp.int32)
     sample = jnp.where(again, lane.sample, jnp.minimum(following, plan.samples - 1))
     ray = _sample_ray(plan, view, samples, lane.x, lane.y, sample)
-    surface = hits[lane.slot * plan.samples + sample]
+    pixels = hits.shape[0] // plan.samples
+    surface = hits[lane.slot % pixels * plan.samples + sample]
     path = new_path(ray, None, surface, plan)._replace(radiance=lane.path.radiance)
     new = lane._replace(
         waiting=jnp.where(again, lane.waiting, lane.waiting & ~lowest), sample=sample, path=path
