@@ -1,4 +1,5 @@
 import itertools
+from pathlib import Path as FilePath
 from typing import NamedTuple
 
 import jax
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 from helpers import AIR, N_D, ball, deviation, furnace, numbers, reflectance
 
+from diffdisp.camera import project
 from diffdisp.dispersion import LINE_C, LINE_D, LINE_F
 from diffdisp.film import Film
 from diffdisp.fresnel import cos_transmitted, fresnel_reflectance
@@ -14,9 +16,12 @@ from diffdisp.geometry import Ray
 from diffdisp.glasses import named_glass
 from diffdisp.integrator import Path, Setting, Tables, bounce, once, paint_table, world_tables
 from diffdisp.planning import Plan, make_plan
+from diffdisp.programs import OPTIONS, QUICK
 from diffdisp.scene import Scene
+from diffdisp.scene_file import load_scene
 from diffdisp.vector import Vec3, vec3
 
+FIXTURES = FilePath(__file__).parents[1] / "fixtures"
 WATER = 1.33340
 FILM = Film(1, 1, wavelengths=[0.5875618])
 IMPACTS = (0.1, 0.5, 0.8, 0.95)
@@ -52,6 +57,23 @@ def tracer_bench(*objects, depth=50):
     scene = furnace(*objects)
     plan = make_plan(scene, FILM, 1, depth, "float64")
     return Bench(jax.tree.map(jnp.asarray, scene), plan)
+
+
+@pytest.mark.parametrize("name", ["references/room", "scenes/default", "targets/ball_nbk7"])
+def test_numpy_lays_out_what_jax_does(name):
+    scene = load_scene(FIXTURES / f"{name}.toml")
+    size = np.asarray(64.0), np.asarray(48.0)
+
+    def tables(scene):
+        return world_tables(scene), paint_table(scene), project(scene.camera, *size)
+
+    found = tables(scene)
+    assert not any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(found))
+    jax.tree.map(
+        lambda one, other: np.testing.assert_allclose(one, other, rtol=1e-15, atol=1e-15),
+        found,
+        jax.jit(tables)(scene),
+    )
 
 
 ALONE = tracer_bench(ball(N_D))
@@ -260,3 +282,17 @@ def test_once_is_the_stage_itself():
     repeated = once(stage, jnp.array(1, jnp.int32))
     jax.tree.map(np.testing.assert_array_equal, repeated, stage())
     jax.tree.map(np.testing.assert_array_equal, once(stage, None), stage())
+
+
+@pytest.mark.parametrize("one", [None, jnp.array(1, jnp.int32)], ids=["barrier", "branch"])
+@pytest.mark.parametrize("options", [OPTIONS, QUICK], ids=["options", "quick"])
+def test_what_is_computed_once_is_not_fused_with_its_users(one, options):
+    def staged(x, one):
+        return jnp.cos(once(lambda: jnp.sin(x), one))
+
+    compiled = jax.jit(staged, compiler_options=options).lower(jnp.ones(100), one).compile()
+    functions = compiled.as_text().split("\n\n")
+    sines, cosines = ({f for f in functions if f" {name}(" in f} for name in ("sine", "cosine"))
+    assert sines
+    assert cosines
+    assert not sines & cosines

@@ -10,7 +10,6 @@ from diffdisp.material import Dielectric, Emitter, Lambertian, Metal
 from diffdisp.scene import (
     Object,
     Scene,
-    glass_names,
     is_glass,
     object_glass,
     texture_of,
@@ -69,7 +68,6 @@ def test_glass_objects():
     objects = [screen(), ball(AIR, name="a"), lamp((0, 3, 0), 1), ball(1.5, (5, 0, 0), name="b")]
     scene = Scene(camera(), objects)
     assert isinstance(scene.objects, tuple)
-    assert glass_names(scene) == ["a", "b"]
     assert [is_glass(obj) for obj in scene.objects] == [False, True, False, True]
     assert object_glass(scene, 1) is AIR
     with pytest.raises(ValueError, match=r"object\[0\] is not glass"):

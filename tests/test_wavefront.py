@@ -66,6 +66,16 @@ def test_a_picture_does_not_depend_on_how_it_is_worked_on(name, value, monkeypat
     np.testing.assert_array_equal(render(ROOM, film, **SINGLE), whole)
 
 
+def test_lanes_that_share_a_pixel_draw_the_same(monkeypatch):
+    pictures = []
+    for shares in (1, 2, 5):
+        monkeypatch.setattr(programs, "_READY", {})
+        monkeypatch.setattr(wavefront, "SHARES", shares)
+        pictures.append(render(DISPERSION, SMALL, **SINGLE))
+    # The same samples, added in another order.
+    np.testing.assert_allclose(pictures[1:], [pictures[0]] * 2, rtol=0, atol=3e-6)
+
+
 def test_another_size_seed_or_number_of_passes_compiles_nothing():
     render(ROOM, SMALL, **SINGLE)
     before = len(programs._READY)

@@ -79,11 +79,6 @@ def is_glass(obj: Object) -> bool:
     return isinstance(obj.material, Dielectric)
 
 
-def glass_names(scene: Scene) -> list[str]:
-    """Names of the glass objects, in the scene's order."""
-    return [obj.name for obj in scene.objects if is_glass(obj)]
-
-
 def object_glass(scene: Scene, index: int) -> Sellmeier:
     """The glass of object number `index`.
 
