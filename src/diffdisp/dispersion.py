@@ -62,8 +62,9 @@ class Sellmeier(eqx.Module):
         self, wavelengths: Float[jax.Array | np.ndarray, " k"]
     ) -> Float[jax.Array | np.ndarray, " k"]:
         """`refractive_index` at each of `wavelengths` (K,), µm."""
-        squared = self._squared_index(wavelengths)
-        return module_of(squared).sqrt(squared)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            squared = self._squared_index(wavelengths)
+            return module_of(squared).sqrt(squared)
 
     @property
     def n_d(self) -> Real:
