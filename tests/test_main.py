@@ -309,6 +309,7 @@ BAD_FITS = {
     "two balls": (SCENE + TWO_BALLS, "", "ball, other"),
     "not glass": (SCENE, "--object screen", "screen"),
     "no such object": (SCENE + TWO_BALLS, "--object third", "third"),
+    "nothing of that name": (SCENE, "--free ball.centre", "'ball.centre'"),
     "unknown prior": (SCENE, "--prior strong", "--prior"),
     "no noise": (SCENE, "--noise 0", "above 0"),
     "negative noise": (SCENE, "--noise -1", "above 0"),
@@ -690,16 +691,18 @@ def test_fit(scene, target, out, capsys, fitted):
     assert json.loads((folder / "fit.json").read_text(encoding="utf-8"))["converged"] is True
     assert iio.imread(folder / "report.png").std() > 5
     assert fitted["shape"] == (6, 8, 2)
-    assert (fitted["object_name"], fitted["prior"]) == (None, "none")
+    assert (fitted["object_name"], fitted["prior"], fitted["free"]) == (None, "none", [])
     assert fitted["noise"] is None
     assert fitted["start"] is None
 
 
 def test_fit_options(scene, target, out, fitted):
     options = ["--object", "ball", "--prior", "fixed-c3", "--noise", "1e-3", "--start", "f2"]
+    options += ["--free", "ball.center", "--free", "gain"]
     assert main(["fit", scene, target, "-o", str(out), *options]) == 0
     assert (fitted["object_name"], fitted["prior"], fitted["noise"]) == ("ball", "fixed-c3", 1e-3)
     assert fitted["start"].name == "F2"
+    assert fitted["free"] == ["ball.center", "gain"]
 
 
 def test_fit_that_does_not_converge(scene, target, out, capsys, fitted):

@@ -7,6 +7,7 @@ import pytest
 from fake_fit import BANDS, blurred_ring, fake_result, fake_target
 
 from diffdisp.dispersion import Sellmeier
+from diffdisp.fitting import FreeValue
 from diffdisp.glasses import named_glass
 from diffdisp.image import Picture
 from diffdisp.report import (
@@ -21,7 +22,7 @@ KEYS = {
     *("converged", "message", "steps", "B", "C", "B_std", "C_std", "covariance", "n_d"),
     *("n_d_std", "V_d", "V_d_std", "P_gF", "wavelength", "n", "n_std", "singular_values"),
     *("determined", "summary", "rms_residual", "nearest_glasses"),
-    *("object", "prior", "P_gF_std"),
+    *("object", "prior", "P_gF_std", "free"),
 }
 
 
@@ -49,6 +50,21 @@ def test_json_holds_the_numbers(tmp_path):
     }
     assert read["converged"] is True
     assert [file.name for file in tmp_path.iterdir()] == ["fit.json"]
+
+
+def test_what_was_free_is_told():
+    free = (FreeValue("ball.center.x", 0.0125, 3e-4), FreeValue("black", 0.02, float("nan")))
+    free += tuple(FreeValue(f"gain[{i}]", 1.1 + i / 100, 2e-3) for i in range(4))
+    result = fake_result(free=free)
+    assert fit_json(result)["free"][0] == {"name": "ball.center.x", "value": 0.0125, "std": 3e-4}
+    assert fit_json(result)["free"][1]["std"] is None
+    table = result_table(result)
+    assert "ball.center.x  0.01250 ± 0.00030\n" in table
+    assert "black          0.02 ± unknown\n" in table
+    assert "gain           1.1000 ± 0.0020 to 1.1300 ± 0.0020\n" in table
+    assert "gain[" not in table
+    one = result_table(fake_result(free=(FreeValue("gain[0]", 1.1, 2e-3),)))
+    assert "gain       1.1000 ± 0.0020\n" in one
 
 
 def test_json_has_null_for_what_is_not_finite(tmp_path):

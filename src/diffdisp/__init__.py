@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from diffdisp.color import encode_srgb
     from diffdisp.dispersion import Sellmeier
     from diffdisp.film import Film, band_middles
-    from diffdisp.fitting import FitResult, fit
+    from diffdisp.fitting import FitResult, FreeValue, fit
     from diffdisp.geometry import Plane, Sphere
     from diffdisp.glasses import glass_source, glass_table, load_glass, named_glass
     from diffdisp.image import Picture, linear_rgb, read_picture, write_picture
@@ -33,6 +33,7 @@ __all__ = [
     "Emitter",
     "Film",
     "FitResult",
+    "FreeValue",
     "Lambertian",
     "Metal",
     "Object",
@@ -70,7 +71,7 @@ _NAMES = {
     "color": ("encode_srgb",),
     "dispersion": ("Sellmeier",),
     "film": ("Film", "band_middles"),
-    "fitting": ("FitResult", "fit"),
+    "fitting": ("FitResult", "FreeValue", "fit"),
     "geometry": ("Plane", "Sphere"),
     "glasses": ("glass_source", "glass_table", "load_glass", "named_glass"),
     "image": ("Picture", "linear_rgb", "read_picture", "write_picture"),

@@ -172,9 +172,17 @@ def _add_fit(parser: argparse.ArgumentParser) -> None:
     add("target", metavar="TARGET", help="the picture: .npz, .tiff, .exr or .png")
     add("-o", dest="output", metavar="DIR", required=True, help="for fit.json and report.png")
     add("--object", metavar="NAME", help="the ball, where the scene has several of glass")
+    add("--free", action="append", default=[], metavar="NAME", help=_FREE_HELP)
     add("--prior", choices=PRIORS, default="none", help="what is known beforehand (default none)")
     add("--noise", type=_noise, metavar="SIGMA", help="of the radiance (default: estimated)")
     add("--start", metavar="GLASS", help="glass to start from (default: that of the scene)")
+
+
+_FREE_HELP = (
+    "fit this too, from its value in the scene: ball.center, ball.radius, ball.center.z, "
+    "screen.point, screen.tile, camera.vertical_fov, ...; gain, a factor for each band; black, "
+    "a level added to all. May be given several times"
+)
 
 
 def _add_glass(parser: argparse.ArgumentParser) -> None:
@@ -388,6 +396,7 @@ def _fit(options: argparse.Namespace) -> int:
             scene,
             target,
             object_name=options.object,
+            free=options.free,
             prior=options.prior,
             noise=options.noise,
             start=start,

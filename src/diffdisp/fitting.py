@@ -1,12 +1,13 @@
 """From a picture to a glass: the coefficients of one ball by least squares, and their errors.
 
 A picture knows a glass only by its index at the film's wavelengths. So each step traces once: the
-picture and its slope ∂L/∂n there. What is left, to find B and C whose n(λ) lowers the linearised
-sum of squares, has a handful of rows and needs no picture: optimistix solves it, non-linear and
+picture and its slopes there, ∂L/∂n and those along other numbers that are free. The others enter
+linearly and are eliminated. What is left, to find B and C whose n(λ) lowers the linearised sum of
+squares, has a handful of rows and needs no picture: optimistix solves it, non-linear and
 ill-conditioned as it is, in milliseconds.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -42,7 +43,9 @@ from diffdisp.dispersion import LINE_C, LINE_D, LINE_F, LINE_G, Sellmeier, domai
 from diffdisp.film import Film
 from diffdisp.glasses import glass_table
 from diffdisp.image import Picture
-from diffdisp.integrator import lane_radiance
+from diffdisp.integrator import Lanes, followed_radiance, lane_radiance
+from diffdisp.linearised import Columns, Eliminated, Linearised, linearise
+from diffdisp.parameters import Parameter, Place, named_parameters, value_at, with_coordinates
 from diffdisp.planning import Plan, make_plan
 from diffdisp.programs import OPTIONS
 from diffdisp.scene import Scene, is_glass, object_glass, with_glass, without_names
@@ -65,7 +68,7 @@ SPLITS = (2, 4)
 samples: most pixels, and those that more samples change most. With `FEW_SAMPLES` in each part that
 is 16 and 64 samples a pixel, by one program."""
 
-REFINED = 0.3
+REFINED = 0.5
 """Part of the pixels that show the ball that get the more samples."""
 
 DETERMINED = 0.1
@@ -74,7 +77,8 @@ DETERMINED = 0.1
 WIDEST = 3.0
 """Standard deviation in log B, log C about the start of what a picture says nothing of: a factor
 of 20 either way, beyond any glass and beyond what a linear error can mean. It keeps fits from
-running away and bounds the errors reported; next to anything that a picture tells it is nothing."""
+running away and bounds the errors reported; next to anything that a picture tells it is nothing.
+The same holds for other free numbers, in the units of their coordinates."""
 
 CLEAN = 1e-5
 """A residual below this part of the brightest value is no noise of a camera."""
@@ -92,9 +96,27 @@ the next one is far below a tenth of the noise: 2.5 times, then 0.06 measured on
 SMALL_STEP = 0.1
 """A step that changes the picture by less than this part of its noise ends the fit."""
 
+UNRESOLVED = 0.5
+"""A pixel whose slopes along the scene's numbers change by more than this part with four times as
+many samples says nothing of them. On the bench at 48 pixels that leaves out the outermost 8 % of
+the radius: errors grow by half, but are true."""
+
+POLISH = 6
+"""Steps more, at most, where more than the glass is free: a scene's numbers move the picture less
+nearly in straight lines."""
+
+NEAR_STEP, ROUGH = 30.0, 1.1
+"""A step that changes the picture by less than this many times its noise is taken though the sum
+of squares rises a little: some samples jump where a silhouette crosses them, by more than what is
+left to gain, but hardly move the point at which the slopes and the residual are at right angles."""
+
 LEAST_CHANGE = (1e-13, 1e-9)
 """Changes of n below this are rounding; and for colour, whose slopes are along six polynomials and
 so not quite those of a glass, as little as steps can still tell."""
+
+EXPOSURE = ("gain", "black")
+"""What may be free of a picture beside the scene: one factor for each channel, and what is added
+to all of them alike."""
 
 PRIORS = ("none", "catalogue", "fixed-c3")
 
@@ -102,12 +124,26 @@ COLOR_WAVELENGTHS = np.arange(430, 681, 10) / 1e3
 """Where a fit to a colour picture reports n(λ), µm: beyond, sRGB sees almost nothing."""
 
 
+class FreeValue(NamedTuple):
+    """What a fit found of a number that was free beside B and C.
+
+    Args:
+        name: as in `ball.center.x`; of the exposure "black", and "gain[0]" for the first channel.
+        value: in the units of the scene; a gain is a factor.
+        std: one standard deviation.
+    """
+
+    name: str
+    value: float
+    std: float
+
+
 @dataclass(frozen=True)
 class FitResult:
     """What a picture says about a glass.
 
     Args:
-        scene: the scene with the fitted glass.
+        scene: the scene with the fitted glass, and what else was fitted of it.
         glass: the fitted glass.
         object_name: name of the ball made of it.
         converged: whether a minimum was reached that explains the picture.
@@ -136,7 +172,8 @@ class FitResult:
         prior: "none", "catalogue" or "fixed-c3".
         noise: the noise that the errors refer to; None where it was estimated from the residual.
         samples: film samples per pixel of the last level: of most pixels, of the hardest.
-        picture: (height, width, channels) render with the fitted glass.
+        picture: (height, width, channels) render with the fitted glass, exposed as the target.
+        free: what else was free.
     """
 
     scene: Scene
@@ -168,6 +205,7 @@ class FitResult:
     noise: float | None
     samples: tuple[int, ...]
     picture: np.ndarray
+    free: tuple[FreeValue, ...] = ()
 
 
 class Coefficients(eqx.Module):
@@ -252,6 +290,57 @@ class Unknowns(NamedTuple):
         return self.project @ (self.coefficients.index(z, self.reference) - index)
 
 
+class Free(NamedTuple):
+    """What is free beside B and C: numbers of the scene, then gains, then a black level.
+
+    Args:
+        names: as users wrote them.
+        parameters: numbers of the scene.
+        gains: one for each channel, or none; the coordinate is a logarithm.
+        blacks: 1 where the black level is free, else 0.
+        brightest: of the target, the black level's unit.
+    """
+
+    names: tuple[str, ...]
+    parameters: tuple[Parameter, ...]
+    gains: int
+    blacks: int
+    brightest: float
+
+    @property
+    def total(self) -> int:
+        """How many coordinates they have."""
+        return len(self.parameters) + self.gains + self.blacks
+
+    @property
+    def places(self) -> tuple[Place, ...]:
+        """Where the scene's numbers stand."""
+        return tuple(parameter.place for parameter in self.parameters)
+
+    @property
+    def units(self) -> np.ndarray:
+        """Of the scene's numbers."""
+        return np.array([parameter.unit for parameter in self.parameters], float)
+
+    def exposure(self, others: np.ndarray) -> tuple[np.ndarray, float]:
+        """The gain of each channel, or one for all, and the black level at some coordinates."""
+        start = len(self.parameters)
+        gains = np.exp(others[start : start + self.gains]) if self.gains else np.ones(1)
+        return gains, float(others[-1] * self.brightest) if self.blacks else 0.0
+
+
+class Point(NamedTuple):
+    """Values of all that is looked for.
+
+    Args:
+        z: coordinates (free,) of B and C.
+        others: those of what else is free.
+    """
+
+    z: np.ndarray
+    others: np.ndarray
+
+
 class Problem(NamedTuple):
     """What stays the same through a fit.
 
@@ -262,6 +351,7 @@ class Problem(NamedTuple):
         film: the target's.
         target: (height, width, channels).
         unknowns: what is looked for.
+        free: what else is.
         progress: called with the step, the root mean square residual and n_d.
     """
 
@@ -271,6 +361,7 @@ class Problem(NamedTuple):
     film: Film
     target: np.ndarray
     unknowns: Unknowns
+    free: Free
     progress: Callable[[int, float, float], None]
 
 
@@ -305,54 +396,14 @@ class Level(NamedTuple):
     Args:
         parts: what renders it; the shares of each block's parts sum to 1.
         target: (blocks, channels).
+        weights: (blocks, 1) of the squared residuals.
         seed: of the render.
     """
 
     parts: tuple[Part, ...]
     target: np.ndarray
+    weights: np.ndarray
     seed: int
-
-
-class Linearised(NamedTuple):
-    """A picture linearised in the index: residual + J a, and J = Q R.
-
-    Args:
-        r: (m, m) R.
-        q: (m,) Qᵀ residual.
-        meat: (m, m) Qᵀ diag(residual²) Q: how the noise that is there enters q.
-        cost: sum of squared residuals.
-        seen: number of residuals that depend on the index.
-        noise: root mean square of those.
-        rms: root mean square of all residuals.
-        explained: part of the variance of what depends on the index that the render explains.
-        slopes: (blocks, t, channels) change of the render along each tangent.
-        picture: (blocks, channels) the render.
-    """
-
-    r: np.ndarray
-    q: np.ndarray
-    meat: np.ndarray
-    cost: float
-    seen: int
-    noise: float
-    rms: float
-    explained: float
-    slopes: np.ndarray
-    picture: np.ndarray
-
-    @property
-    def weight(self) -> np.ndarray:
-        """How much the index changes the picture (blocks, channels)."""
-        return np.max(np.abs(self.slopes), axis=1)
-
-    def moved(self, change: np.ndarray) -> "Linearised":
-        """The same after a change (m,) of the index, as far as the picture is linear in it."""
-        bands = self.slopes.shape[1] == 1
-        shift = self.slopes[:, 0] * change if bands else np.tensordot(change, self.slopes, (0, 1))
-        q = self.q + self.r @ change
-        cost = self.cost + float(np.sum(q**2) - np.sum(self.q**2))
-        rms = self.rms * np.sqrt(cost / self.cost) if self.cost > 0 else 0.0
-        return self._replace(q=q, cost=cost, rms=float(rms), picture=self.picture + shift)
 
 
 def fit(
@@ -360,6 +411,7 @@ def fit(
     target: Picture,
     *,
     object_name: str | None = None,
+    free: Sequence[str] = (),
     prior: str = "none",
     noise: float | None = None,
     start: Sellmeier | None = None,
@@ -372,6 +424,10 @@ def fit(
         target: the picture; its film is the fit's. Its `samples`, `depth` and `seed` are used in
             the last level where it has them.
         object_name: the ball, where the scene has several of glass.
+        free: what is not known well beside the glass and is fitted too, from its value in the
+            scene: numbers of the scene by name, such as "ball.center", "ball.center.z",
+            "screen.tile" or "camera.vertical_fov"; "gain", a factor for each channel of the
+            picture; "black", what is added to all of them. Errors hold for not knowing them.
         prior: "none"; "catalogue", a Gaussian in log B, log C over the table's glasses;
             "fixed-c3", which holds C₃ at its start.
         noise: standard deviation of the target's values where it is known; otherwise errors are
@@ -384,7 +440,8 @@ def fit(
 
     Raises:
         ValueError: no such glass ball, or several and no name; a start with a pole in the band or
-            without any free coefficient; an unknown prior; a noise that is not positive.
+            without any free coefficient; an unknown prior; a noise that is not positive; a name
+            in `free` that the scene does not have.
     """
     if prior not in PRIORS:
         raise ValueError(f"prior {prior!r}: allowed are {', '.join(PRIORS)}")
@@ -396,7 +453,7 @@ def fit(
     film = target.film
     check_glasses(scene, *film_range(film))
     with jax.enable_x64(True):
-        problem = _problem(scene, number, target, prior, progress or _silent)
+        problem = _problem(scene, number, target, free, prior, progress or _silent)
         return _fit(problem, target, prior, noise)
 
 
@@ -421,6 +478,7 @@ def _problem(
     scene: Scene,
     number: int,
     target: Picture,
+    free: Sequence[str],
     prior: str,
     progress: Callable[[int, float, float], None],
 ) -> Problem:
@@ -428,8 +486,8 @@ def _problem(
     glass = object_glass(scene, number)
     low, high = film_range(film)
     B, C = np.asarray(glass.B, np.float64), np.asarray(glass.C, np.float64)
-    free = (B != 0) & (C > 0)
-    mask = np.concatenate([free, free])
+    terms = (B != 0) & (C > 0)
+    mask = np.concatenate([terms, terms])
     if prior == "fixed-c3":
         mask[5] = False
     if not mask.any():
@@ -445,7 +503,24 @@ def _problem(
     mean, rows = _prior(prior, C, mask)
     ball = [i for i, obj in enumerate(scene.objects) if is_glass(obj)].index(number)
     unknowns = Unknowns(coefficients, reference, project, mean, rows)
-    return Problem(scene, number, ball, film, target.radiance, unknowns, progress)
+    others = _free(scene, number, target, free)
+    return Problem(scene, number, ball, film, target.radiance, unknowns, others, progress)
+
+
+def _free(scene: Scene, number: int, target: Picture, names: Sequence[str]) -> Free:
+    """What some names free, of the scene and of the exposure."""
+    for name in EXPOSURE:
+        if names.count(name) > 1:
+            raise ValueError(f"{name} is free twice")
+    shape: Any = scene.objects[number].shape
+    of_scene = [name for name in names if name not in EXPOSURE]
+    return Free(
+        tuple(names),
+        named_parameters(scene, of_scene, float(shape.radius)),
+        target.film.channels if "gain" in names else 0,
+        int("black" in names),
+        float(np.max(np.abs(target.radiance))) or 1.0,
+    )
 
 
 def _polynomials(wavelengths: np.ndarray) -> np.ndarray:
@@ -488,7 +563,7 @@ def _level(
     cut = target[: height * size, : width * size]
     means = cut.reshape(height, size, width, size, -1).mean((1, 3)).reshape(height * width, -1)
     part = _part(problem, size, samples, depth, np.arange(height * width), split)
-    return Level((part,), means, seed)
+    return Level((part,), means, np.ones((len(means), 1)), seed)
 
 
 def _part(
@@ -520,6 +595,7 @@ def _part(
 def _traced(
     plan: Plan,
     ball: int,
+    places: tuple[Place, ...],
     scene: Scene,
     spectrum: Spectrum,
     size: tuple[Real, Real],
@@ -527,81 +603,116 @@ def _traced(
     run: RunNumbers,
     index: Array,
     tangents: Array,
+    coordinates: Array,
+    units: Array,
 ) -> jax.Array:
-    """Pixels (chunks, pixels, 1 + t, channels): radiance, and its change along each tangent."""
+    """Pixels (chunks, pixels, 1 + k + t, channels).
+
+    Radiance, and its changes: along the coordinates of k numbers of the scene, and along t changes
+    of one ball's index.
+    """
     scene, spectrum, size, chunks, run = in_dtype((scene, spectrum, size, chunks, run), plan.dtype)
     indices = glass_indices(scene, spectrum.wavelengths)
+    at = (*indices[:ball], index, *indices[ball + 1 :])
 
     def chunk(pixels: Pixels) -> Array:
-        lanes = chunk_lanes(plan, scene, spectrum, size, pixels, run)
+        def lanes(coordinates: Array) -> Lanes:
+            changed = with_coordinates(scene, places, units, coordinates)
+            return chunk_lanes(plan, changed, spectrum, size, pixels, run)
+
+        def of_scene(coordinates: Array) -> Array:
+            return combine(plan, followed_radiance(plan, at, lanes(coordinates)), spectrum)
 
         def of_index(index: Array) -> Array:
-            changed = (*indices[:ball], index, *indices[ball + 1 :])
-            return combine(plan, lane_radiance(plan, changed, lanes), spectrum)
+            changed = (*at[:ball], index, *at[ball + 1 :])
+            return combine(plan, lane_radiance(plan, changed, lanes(coordinates)), spectrum)
 
         def change(tangent: Array) -> tuple[Array, Array]:
             return jax.jvp(of_index, (index,), (tangent,))
 
+        def along(move: Array) -> Array:
+            return jax.jvp(of_scene, (coordinates,), (move,))[1]
+
         value, slopes = jax.vmap(change, out_axes=(None, 0))(tangents)
-        return jnp.moveaxis(jnp.concatenate([value[None], slopes], axis=0), 0, 1)
+        if places:
+            moves = jnp.eye(len(places), dtype=plan.dtype)
+            slopes = jnp.concatenate([jax.vmap(along)(moves), slopes])
+        return jnp.moveaxis(jnp.concatenate([value[None], slopes]), 0, 1)
 
     return each_chunk(chunk, chunks)
 
 
-_traced_jit = jax.jit(_traced, static_argnums=(0, 1), compiler_options=OPTIONS)
+_traced_jit = jax.jit(_traced, static_argnums=(0, 1, 2), compiler_options=OPTIONS)
 
 
 def _trace(
-    problem: Problem, part: Part, z: np.ndarray, seed: int, cutoff: float
+    problem: Problem, part: Part, at: Point, seed: int, cutoff: float, along_scene: bool
 ) -> Float[np.ndarray, "blocks derivatives channels"]:
-    """Radiance of a part's blocks, and its change along each tangent."""
-    waves = np.asarray(part.spectrum.wavelengths)
-    index = np.asarray(problem.unknowns.coefficients.index(z, waves.ravel())).reshape(waves.shape)
+    """Radiance of a part's blocks, and its changes as `_traced` has them.
+
+    Those along the scene's numbers cost several times as much as all else: only if asked for.
+    """
+    waves, free = np.asarray(part.spectrum.wavelengths), problem.free
+    coefficients = problem.unknowns.coefficients
+    index = np.asarray(coefficients.index(at.z, waves.ravel())).reshape(waves.shape)
     size, run = film_size(problem.film), run_numbers(part.plan, seed, cutoff)
+    scene, coordinates = problem.scene, at.others[: len(free.parameters)]
+    places, units = free.places, free.units
+    if not along_scene:
+        scene = _with_others(problem, at.others)
+        places, units, coordinates = (), units[:0], coordinates[:0]
+    scene = without_names(scene)
 
     def trace(chunks: Pixels) -> np.ndarray:
-        fixed = (
-            without_names(problem.scene),
-            part.spectrum,
-            size,
-            chunks,
-            run,
-            index,
-            part.tangents,
-        )
-        return np.asarray(_traced_jit(part.plan, problem.ball, *fixed))
+        fixed = (scene, part.spectrum, size, chunks, run, index, part.tangents)
+        return np.asarray(_traced_jit(part.plan, problem.ball, places, *fixed, coordinates, units))
 
     values = over_chunks(trace, part.chunks, "float64")
     return np.mean(values.reshape(-1, *values.shape[2:])[part.place], axis=1)
 
 
-def _linearise(problem: Problem, level: Level, z: np.ndarray, cutoff: float) -> Linearised:
-    """The picture and its slopes at coordinates `z`, reduced to what a step needs."""
-    tangents = len(level.parts[0].tangents)
-    joined = np.zeros((len(level.target), 1 + tangents, problem.film.channels))
+def _linearise(
+    problem: Problem, level: Level, at: Point, cutoff: float, known: Columns | None = None
+) -> Linearised:
+    """The picture and its slopes at a point, reduced to what a step needs.
+
+    Args:
+        problem: what stays the same.
+        level: the resolution.
+        at: the point.
+        cutoff: part of its light with which a path ends.
+        known: slopes along the scene's numbers from another point, so near that they still hold.
+    """
+    free, channels = problem.free, problem.film.channels
+    count, bands = len(free.parameters), problem.film.wavelengths is not None
+    tangents, along = len(level.parts[0].tangents), count if known is None else 0
+    joined = np.zeros((len(level.target), 1 + along + tangents, channels))
     for part in level.parts:
-        joined[part.rows] += part.share * _trace(problem, part, z, level.seed, cutoff)
-    picture, slopes = joined[:, 0], joined[:, 1:]
-    residual = picture - level.target
-    seen = np.any(slopes != 0, axis=1)
-    cost, m = float(np.sum(residual**2)), len(problem.unknowns.project)
-    if problem.film.wavelengths is None:
-        rows = np.moveaxis(slopes, 1, -1).reshape(-1, m)
-        basis, r = np.linalg.qr(rows)
-        flat = residual.ravel()
-        q, meat = basis.T @ flat, (basis * flat[:, None] ** 2).T @ basis
-    else:
-        # A band depends on the index at its own wavelength alone: J is one column a band.
-        norms = np.sqrt(np.sum(slopes[:, 0] ** 2, axis=0))
-        basis = slopes[:, 0] / np.where(norms > 0, norms, 1.0)
-        r, q = np.diag(norms), np.sum(basis * residual, axis=0)
-        meat = np.diag(np.sum((basis * residual) ** 2, axis=0))
-    count = int(seen.sum())
-    noise = np.sqrt(np.sum(residual[seen] ** 2) / max(count - m, 1))
-    rms = np.sqrt(np.mean(residual**2))
-    contrast = np.sum((level.target[seen] - np.mean(level.target[seen])) ** 2) if count else 1.0
-    explained = 1 - float(np.sum(residual[seen] ** 2)) / max(float(contrast), 1e-300)
-    return Linearised(r, q, meat, cost, count, float(noise), float(rms), explained, slopes, picture)
+        traced = _trace(problem, part, at, level.seed, cutoff, known is None)
+        joined[part.rows] += part.share * traced
+    gains, black = free.exposure(at.others)
+    joined *= gains
+    radiance, slopes = joined[:, :1], joined[:, 1:]
+    if known is not None:
+        again = known.values[..., :count].transpose(1, 2, 0)
+        slopes = np.concatenate([again, slopes], axis=1)
+    # The gains' coordinates are logarithms: the slope along one is what its channel shows.
+    levels = np.full((len(joined), free.blacks, channels), free.brightest)
+    shown = [slopes[:, :count], radiance[:, : min(free.gains, 1)], levels, slopes[:, count:]]
+    own = np.arange(channels)[:, None]
+    unknown = [
+        np.broadcast_to(np.arange(count), (channels, count)),
+        count + own[:, : min(free.gains, 1)],
+        np.full((channels, free.blacks), count + free.gains),
+        free.total + (own if bands else np.broadcast_to(np.arange(tangents), (channels, tangents))),
+    ]
+    columns = Columns(
+        np.ascontiguousarray(np.concatenate(shown, axis=1).transpose(2, 0, 1)),
+        np.concatenate(unknown, axis=1),
+        free.total,
+        free.total + len(problem.unknowns.project),
+    )
+    return linearise(radiance[:, 0] + black, level.target, columns, level.weights, WIDEST)
 
 
 class Step(NamedTuple):
@@ -664,33 +775,37 @@ def _solve_step(step: Step) -> Array:
     return step.z0 + solution.value
 
 
-def _next_z(
-    unknowns: Unknowns, z: np.ndarray, anchor: np.ndarray, lin: Linearised, damping: float
-) -> np.ndarray:
-    """The coordinates that the picture linearised at `z` asks for."""
-    index = unknowns.coefficients.index(z, unknowns.reference)
+def _next_point(
+    unknowns: Unknowns, at: Point, anchor: np.ndarray, lin: Linearised, damping: float
+) -> tuple[Point, np.ndarray]:
+    """The point that the picture linearised at `at` asks for, and the change (total,) to it."""
+    left = lin.eliminated(damping)
+    index = unknowns.coefficients.index(at.z, unknowns.reference)
     near = lin.noise / WIDEST
-    size = max(float(np.linalg.norm(lin.q)), 1e-300)
+    size = max(float(np.linalg.norm(left.q)), 1e-300)
     step = Step(
         unknowns,
-        z,
+        at.z,
         index,
-        lin.r / size,
-        lin.q / size,
-        np.sqrt(damping) * np.sqrt(np.sum(lin.r**2, axis=0)) / size,
+        left.r / size,
+        left.q / size,
+        np.sqrt(damping) * np.sqrt(np.sum(left.r**2, axis=0)) / size,
         anchor,
         np.asarray(near / size),
         np.asarray(lin.noise / size),
     )
-    return np.asarray(_solve_step(step))
+    z = np.asarray(_solve_step(step))
+    change = np.asarray(unknowns.change(z, index))
+    moves = left.others(change)
+    return Point(z, at.others + moves), np.concatenate([moves, change])
 
 
 def _objective(
-    unknowns: Unknowns, lin: Linearised, z: np.ndarray, anchor: np.ndarray, noise: float
+    unknowns: Unknowns, lin: Linearised, at: Point, anchor: np.ndarray, noise: float
 ) -> float:
     """What a step has to lower: squared residuals, and what is known besides, in their unit."""
-    known = unknowns.prior_rows @ np.asarray(unknowns.coefficients.logarithms(z))
-    far = np.sum(((z - anchor) / WIDEST) ** 2) + np.sum((known - unknowns.prior_mean) ** 2)
+    known = unknowns.prior_rows @ np.asarray(unknowns.coefficients.logarithms(at.z))
+    far = np.sum(((at.z - anchor) / WIDEST) ** 2) + np.sum((known - unknowns.prior_mean) ** 2)
     return lin.cost + noise**2 * float(far)
 
 
@@ -698,67 +813,91 @@ class Descent(NamedTuple):
     """Where a level's steps ended.
 
     Args:
-        z: (free,) coordinates.
+        at: the point.
         lin: the picture linearised there.
         steps: pictures traced.
         converged: whether a next step would change nothing that the picture can tell.
     """
 
-    z: np.ndarray
+    at: Point
     lin: Linearised
     steps: int
     converged: bool
 
 
 def _descend(
-    problem: Problem, level: Level, z: np.ndarray, cutoff: float, most: int, small: float
+    problem: Problem,
+    level: Level,
+    at: Point,
+    cutoff: float,
+    most: int,
+    small: float,
+    along: Level | None = None,
 ) -> Descent:
-    """Gauss-Newton steps from `z`, `most` at most, until one is small.
+    """Gauss-Newton steps from a point, `most` at most, until one is small.
 
     Args:
         problem: what stays the same.
         level: the resolution.
-        z: coordinates to start from.
+        at: where to start.
         cutoff: part of its light with which a path ends.
         most: pictures to trace at most.
         small: a step that changes the picture by less than this part of its noise is the last.
+        along: where slopes along the scene's numbers are taken; by default on the level itself.
     """
+
+    def look(at: Point, known: Columns | None = None) -> Linearised:
+        if known is None and along is not None:
+            known = _linearise(problem, along, at, cutoff).columns
+        return _linearise(problem, level, at, cutoff, known)
+
     unknowns = problem.unknowns
     least = LEAST_CHANGE[0] if problem.film.wavelengths is not None else LEAST_CHANGE[1]
-    lin, damping, converged = _linearise(problem, level, z, cutoff), 0.0, False
-    steps, anchor = 1, z
+    lin, damping, converged = look(at), 0.0, False
+    steps, anchor = 1, at.z
     while steps < most and not converged:
-        problem.progress(steps, lin.rms, _n_d(unknowns, z))
-        index = np.asarray(unknowns.coefficients.index(z, unknowns.reference))
-        new = _next_z(unknowns, z, anchor, lin, damping)
-        change = np.asarray(unknowns.change(new, index))
-        largest = np.max(np.abs(unknowns.coefficients.index(new, unknowns.reference) - index))
-        visible = np.linalg.norm(lin.r @ change)
+        problem.progress(steps, lin.rms, _n_d(unknowns, at.z))
+        # Whether a minimum is near, a step tells that nothing holds back.
+        new, change = _next_point(unknowns, at, anchor, lin, 0.0)
+        largest, visible = _largest(unknowns, at, new), np.linalg.norm(lin.r @ change)
         if largest < least or visible < small * lin.noise:
             # So near the picture is linear: it need not be traced again.
-            z, lin, converged = new, lin.moved(change), True
+            at, lin, converged = new, lin.moved(change), True
             break
-        tried = _linearise(problem, level, new, cutoff)
+        if damping:
+            new, change = _next_point(unknowns, at, anchor, lin, damping)
+            largest, visible = _largest(unknowns, at, new), np.linalg.norm(lin.r @ change)
+        near = visible < NEAR_STEP * lin.noise
+        # After so small a step the scene's slopes, which cost most, are still the same.
+        tried = look(new, lin.columns if visible < LINEAR_STEP * lin.noise else None)
         steps += 1
-        before, after = (
-            _objective(unknowns, picture, at, anchor, lin.noise)
-            for picture, at in ((lin, z), (tried, new))
+        had, has = (
+            _objective(unknowns, picture, point, anchor, lin.noise)
+            for picture, point in ((lin, at), (tried, new))
         )
-        if after <= before:
-            z, lin, damping = new, tried, damping / 10 if damping > 1e-2 else 0.0
-        elif largest < 100 * least:
+        rough = near and has < ROUGH * had
+        if has > had and largest < 100 * least:
             converged = True  # what is left of the residual is rounding
+        elif has <= had or rough:
+            at, lin, damping = new, tried, damping / 10 if damping > 1e-2 else 0.0
         else:
             damping = max(10 * damping, 1.0)
-    return Descent(z, lin, steps, converged)
+    return Descent(at, lin, steps, converged)
+
+
+def _largest(unknowns: Unknowns, at: Point, new: Point) -> float:
+    """The largest change of the index, or of another's coordinate, between two points."""
+    before, after = (unknowns.coefficients.index(p.z, unknowns.reference) for p in (at, new))
+    moves = np.abs(new.others - at.others)
+    return max(float(np.max(np.abs(after - before))), float(np.max(moves, initial=0.0)))
 
 
 def _n_d(unknowns: Unknowns, z: np.ndarray) -> float:
     return float(unknowns.coefficients.index(z, np.array([LINE_D]))[0])
 
 
-def _refined(problem: Problem, few: Descent, depth: int, seed: int) -> tuple[Level, np.ndarray]:
-    """A whole picture with samples as `SPLITS` says, and the coordinates (free,) to go on from.
+def _refined(problem: Problem, few: Descent, level: Level, depth: int) -> tuple[Level, Point]:
+    """A whole picture with samples as `SPLITS` says, and the point to go on from.
 
     Near the rim a ball shows the whole scene within a few pixels, where footprints are neither
     small nor straight. The pixels that weigh most in the index and change most with the samples
@@ -768,14 +907,13 @@ def _refined(problem: Problem, few: Descent, depth: int, seed: int) -> tuple[Lev
     Args:
         problem: what stays the same.
         few: where the steps on a whole picture of few samples ended.
+        level: the whole picture with as many samples as most pixels get.
         depth: segments of a path.
-        seed: of the renders.
 
     Source:
         Richardson, Phil. Trans. A 210 (1911) 307, extrapolation to a step of zero.
     """
-    level = _level(problem, 1, FEW_SAMPLES, depth, seed, SPLITS[0])
-    some = _linearise(problem, level, few.z, CUTOFF)
+    some = _linearise(problem, level, few.at, CUTOFF)
     change = np.max(np.abs(some.picture - few.lin.picture) * some.weight, axis=1)
     hard = np.zeros(len(change), bool)
     hard[np.argsort(-change)[: int(np.sum(some.weight.any(axis=1)) * REFINED)]] = True
@@ -788,12 +926,43 @@ def _refined(problem: Problem, few: Descent, depth: int, seed: int) -> tuple[Lev
         )
         if which.any()
     )
-    z = _next_z(problem.unknowns, few.z, few.z, some, 0.0)
-    return level._replace(parts=parts), z
+    at, _ = _next_point(problem.unknowns, few.at, few.at.z, some, 0.0)
+    # What a quarter of the samples changes tells the error of these, and so what a residual tells.
+    error = np.max(np.abs(some.picture - few.lin.picture), axis=1, keepdims=True) / 3
+    error[hard] /= SPLITS[1] ** 2 / SPLITS[0] ** 2
+    residual = np.abs(some.picture - level.target)[some.weight > 0]
+    sigma = max(1.4826 * float(np.median(residual)) if residual.size else 0.0, 1e-300)
+    weights = 1 / (1 + (error / sigma) ** 2)
+    if problem.free.parameters:
+        weights *= _resolved(problem, few.lin.columns, some.columns)
+    return level._replace(parts=parts, weights=weights), at
 
 
-def _starts(problem: Problem, level: Level, most: int) -> list[np.ndarray]:
-    """Coordinates to start from: those that explain a coarse picture best.
+def _resolved(problem: Problem, few: Columns, many: Columns) -> np.ndarray:
+    """Weights (blocks, 1): 0 for pixels whose slopes along the scene's numbers need more samples.
+
+    Where a silhouette runs through a pixel its slopes are those of few samples next to the edge:
+    steep, and far from the pixel's. There a picture would seem to tell much that it does not. The
+    neighbours of such pixels go with them: a silhouette may pass between the samples.
+    """
+    count, film = len(problem.free.parameters), problem.film
+    scale = np.linalg.norm(many.values[..., :count], axis=(0, 1))
+    at_all = np.where(scale > 0, scale, 1.0)
+    values, changes = (
+        np.linalg.norm(slopes[..., :count] / at_all, axis=(0, 2))
+        for slopes in (many.values, many.values - few.values)
+    )
+    typical = np.sqrt(np.mean(values**2))
+    wide = np.pad(
+        (changes > UNRESOLVED * np.maximum(values, typical)).reshape(film.height, film.width), 1
+    )
+    rows = wide[:-2] | wide[1:-1] | wide[2:]
+    unsure = rows[:, :-2] | rows[:, 1:-1] | rows[:, 2:]
+    return np.where(unsure, 0.0, 1.0).reshape(-1, 1)
+
+
+def _starts(problem: Problem, level: Level, most: int) -> list[Point]:
+    """Points to start from: those that explain a coarse picture best, at the best exposure.
 
     The coarse picture is traced once at many indices. Any glass's picture is then an
     interpolation between them, so hundreds of glasses cost nothing: the start with its B scaled
@@ -803,7 +972,7 @@ def _starts(problem: Problem, level: Level, most: int) -> list[np.ndarray]:
     table = _index_table(problem, level)
     waves, weights, columns = _few_wavelengths(film)
     target = level.target[:, columns]
-    found = []
+    found: list[tuple[float, float, Point]] = []
     for z in _variants(unknowns, waves):
         index = np.asarray(unknowns.coefficients.index(z, waves))
         if index.min() < INDEX_GRID[0] or index.max() >= INDEX_GRID[-1]:
@@ -813,13 +982,46 @@ def _starts(problem: Problem, level: Level, most: int) -> list[np.ndarray]:
         part = (place - left)[:, None, None]
         seen = table[left] * (1 - part) + table[left + 1] * part
         picture = np.einsum("jpc,jcd->pd", seen, weights, optimize=True)
-        found.append((float(np.sum((picture - target) ** 2)), np.mean(index), z))
+        others = _exposed(problem.free, picture, target, columns)
+        gains, black = problem.free.exposure(others)
+        some = gains[columns] if problem.free.gains else gains
+        cost = float(np.sum((some * picture + black - target) ** 2))
+        found.append((cost, float(np.mean(index)), Point(z, others)))
     found.sort(key=lambda entry: entry[0])
-    chosen: list[tuple[float, float, np.ndarray]] = []
+    chosen: list[tuple[float, float, Point]] = []
     for entry in found:
         if len(chosen) < most and all(abs(entry[1] - c[1]) > 0.03 for c in chosen):
             chosen.append(entry)
-    return [z for _, _, z in chosen] or [unknowns.coefficients.start()]
+    return [at for _, _, at in chosen] or [
+        Point(unknowns.coefficients.start(), np.zeros(problem.free.total))
+    ]
+
+
+def _exposed(
+    free: Free, picture: np.ndarray, target: np.ndarray, columns: np.ndarray
+) -> np.ndarray:
+    """Coordinates of the others: the scene's as they are, and the exposure that fits best.
+
+    Args:
+        free: what is free.
+        picture: (blocks, d) some channels of a render.
+        target: (blocks, d) of the target.
+        columns: (d,) their numbers; between them gains are interpolated.
+    """
+    others = np.zeros(free.total)
+    squares, sums = np.sum(picture**2, axis=0) + 1e-300, np.sum(picture, axis=0)
+    products, missing = np.sum(picture * target, axis=0), np.sum(target - picture)
+    black = missing / picture.size
+    if free.gains:
+        rest = picture.size - np.sum(sums**2 / squares)
+        black = (np.sum(target) - np.sum(sums * products / squares)) / max(rest, 1e-300)
+        black *= free.blacks
+        gains = np.log(np.clip((products - black * sums) / squares, 1e-3, 1e3))
+        start = len(free.parameters)
+        others[start : start + free.gains] = np.interp(np.arange(free.gains), columns, gains)
+    if free.blacks:
+        others[-1] = black / free.brightest
+    return others
 
 
 def _index_table(problem: Problem, level: Level) -> np.ndarray:
@@ -905,22 +1107,28 @@ def _fit(problem: Problem, target: Picture, prior: str, noise: float | None) -> 
     film, depth, seed = problem.film, target.depth or 50, target.seed or 0
     coarse = max(1, -(-max(film.width, film.height) // COARSE_PIXELS))
     level = _level(problem, coarse, FEW_SAMPLES, depth, seed)
-    ends = [_descend(problem, level, z, CUTOFF, 8, 1.0) for z in _starts(problem, level, 3)]
+    ends = [_descend(problem, level, at, CUTOFF, 8, 1.0) for at in _starts(problem, level, 3)]
     best = min(ends, key=lambda end: end.lin.cost)
+    along = None
     if target.samples is None:
         level = _level(problem, 1, FEW_SAMPLES, depth, seed)
-        best = _descend(problem, level, best.z, CUTOFF, 20, 1.0)
-        level, z = _refined(problem, best, depth, seed)
+        many = _level(problem, 1, FEW_SAMPLES, depth, seed, SPLITS[0])
+        best = _descend(problem, level, best.at, CUTOFF, 20, 1.0)
+        level, at = _refined(problem, best, many, depth)
+        along = many if problem.free.parameters else None
     else:
-        level, z = _level(problem, 1, target.samples, depth, seed), best.z
-    best = _descend(problem, level, z, CUTOFF, 30, LINEAR_STEP)
-    error = best.lin.noise / max(float(np.max(np.abs(best.lin.r))), 1e-300)
+        level, at = _level(problem, 1, target.samples, depth, seed), best.at
+    best = _descend(problem, level, at, CUTOFF, 30, LINEAR_STEP, along)
+    if problem.free.parameters and best.converged:
+        polished = _descend(problem, level, best.at, CUTOFF, POLISH, SMALL_STEP, along)
+        best = polished._replace(steps=best.steps + polished.steps, converged=True)
+    error = best.lin.noise / max(float(np.max(np.abs(best.lin.eliminated().r))), 1e-300)
     if NEGLECTED * CUTOFF > SMALL_STEP * error:
         # So clean a picture shows the light of the paths that were ended early.
-        exact = _descend(problem, level, best.z, 0.0, 30, SMALL_STEP)
+        exact = _descend(problem, level, best.at, 0.0, 30, SMALL_STEP)
         best = exact._replace(steps=best.steps + exact.steps)
-    known = {"samples": target.samples, "depth": target.depth, "seed": target.seed}
-    own = ", ".join(f"{name} {value}" for name, value in known.items() if value is not None)
+    said = {"samples": target.samples, "depth": target.depth, "seed": target.seed}
+    own = ", ".join(f"{name} {value}" for name, value in said.items() if value is not None)
     return _result(problem, best, level, prior, noise, own)
 
 
@@ -933,10 +1141,13 @@ def _result(
     own: str,
 ) -> FitResult:
     """The result in the words of the glass, with its errors."""
-    unknowns, lin, film = problem.unknowns, end.lin, problem.film
-    z = jnp.asarray(end.z)
+    unknowns, lin, film, free = problem.unknowns, end.lin, problem.film, problem.free
+    z = jnp.asarray(end.at.z)
     meat, noise, source = _noise(lin, given, float(np.max(np.abs(problem.target))))
-    covariance = _log_covariance(unknowns, z, lin, meat, noise)
+    if free.names:
+        source += f", and with {' and '.join(free.names)} free"
+    whole = _covariance(unknowns, z, lin, meat, noise)
+    covariance = whole[free.total :, free.total :]
     to_logs = jax.jacfwd(unknowns.coefficients.logarithms)(z)
 
     def with_error(f: Callable[[jax.Array], jax.Array]) -> tuple[np.ndarray, np.ndarray]:
@@ -955,9 +1166,10 @@ def _result(
     determined = int(np.sum(singular > 1 / DETERMINED))
     glass = Sellmeier(B, C, object_glass(problem.scene, problem.number).validity)
     converged, message = _verdict(end)
-    ranked = _nearest(unknowns, end.z, lin, meat)
+    left, within = lin.eliminated(), meat[free.total :, free.total :]
+    scene = _with_others(problem, end.at.others)
     return FitResult(
-        scene=with_glass(problem.scene, problem.number, glass),
+        scene=with_glass(scene, problem.number, glass),
         glass=glass,
         object_name=problem.scene.objects[problem.number].name,
         converged=converged,
@@ -981,21 +1193,47 @@ def _result(
         determined=determined,
         summary=_summary(waves, n_std, determined, len(singular), source, prior, own),
         rms_residual=lin.rms,
-        nearest_glasses=ranked,
+        nearest_glasses=_nearest(unknowns, end.at.z, left, within),
         prior=prior,
         noise=given,
         samples=tuple(part.plan.samples * part.split**2 for part in level.parts),
         picture=lin.picture.reshape(problem.target.shape),
+        free=tuple(_free_values(free, scene, end.at.others, np.sqrt(np.diag(whole)))),
     )
+
+
+def _with_others(problem: Problem, others: np.ndarray) -> Scene:
+    """The scene with its free numbers at some coordinates."""
+    free = problem.free
+    coordinates = others[: len(free.parameters)]
+    scene = with_coordinates(problem.scene, free.places, free.units, coordinates)
+    moved: Scene = jax.tree.map(np.asarray, scene)
+    return moved
+
+
+def _free_values(
+    free: Free, scene: Scene, others: np.ndarray, errors: np.ndarray
+) -> Iterator[FreeValue]:
+    """What was free beside B and C, in the units of the scene."""
+    for parameter, error in zip(free.parameters, errors, strict=False):
+        value = value_at(scene, parameter.place)
+        unit = value if parameter.place.positive else parameter.unit
+        yield FreeValue(parameter.name, value, float(unit * error))
+    gains, black = free.exposure(others)
+    for channel in range(free.gains):
+        gain, error = float(gains[channel]), errors[len(free.parameters) + channel]
+        yield FreeValue(f"gain[{channel}]", gain, float(gain * error))
+    if free.blacks:
+        yield FreeValue("black", black, float(free.brightest * errors[free.total - 1]))
 
 
 def _noise(lin: Linearised, given: float | None, brightest: float) -> tuple[np.ndarray, float, str]:
     """How noise enters q (m, m), its standard deviation, and where both come from, in words."""
     if given is not None and lin.noise <= 1.1 * given:
-        return given**2 * np.eye(len(lin.q)), given, f"at the given noise of {given:g}"
+        return given**2 * lin.white + lin.held, given, f"at the given noise of {given:g}"
     if given is None and lin.noise < CLEAN * brightest:
         return (
-            ASSUMED_NOISE**2 * np.eye(len(lin.q)),
+            ASSUMED_NOISE**2 * lin.white + lin.held,
             ASSUMED_NOISE,
             f"the picture is clean; at an assumed noise of {ASSUMED_NOISE:g}",
         )
@@ -1005,33 +1243,40 @@ def _noise(lin: Linearised, given: float | None, brightest: float) -> tuple[np.n
     return lin.meat, lin.noise, source
 
 
-def _log_covariance(
+def _covariance(
     unknowns: Unknowns, z: Array, lin: Linearised, meat: np.ndarray, noise: float
 ) -> np.ndarray:
-    """Covariance (free, free) of log |B| and log C.
+    """Covariance (others + free, others + free) of the others, and of log |B| and log C.
 
     Source:
         White, Econometrica 48 (1980) 817: the covariance that holds where the noise is not the
         same everywhere, from the residuals themselves; by singular values, so that nothing
         nearly singular is squared.
     """
+    left, p = lin.eliminated(), lin.columns.others
     index = unknowns.coefficients.index(z, unknowns.reference)
     to_logs = jnp.diag(jax.jacfwd(unknowns.coefficients.logarithms)(z))
     slope = np.asarray(jax.jacfwd(lambda z: unknowns.change(z, index))(z) / to_logs[None, :])
-    rows = np.concatenate([lin.r @ slope / noise, unknowns.prior_rows], axis=0)
-    left, scales, right = np.linalg.svd(rows, full_matrices=True)
-    count, m = len(scales), len(meat)
-    within = np.eye(len(rows))
-    within[:m, :m] = meat / noise**2
-    core = left[:, :count].T @ within @ left[:, :count]
+    rows = np.concatenate([left.r @ slope / noise, unknowns.prior_rows], axis=0)
+    basis, scales, right = np.linalg.svd(rows, full_matrices=True)
+    count, m = len(scales), len(left.r)
+    # What comes in: for the others, for the index in units of the noise, and from the prior.
+    unit = np.concatenate([np.ones(p), np.full(m, 1 / noise)])
+    within = np.eye(p + len(rows))
+    within[: p + m, : p + m] = meat * unit * unit[:, None]
     gain = scales / (scales**2 + WIDEST**-2)
-    known = gain[:, None] * core * gain[None, :]
+    logs = right[:count].T @ (gain[:, None] * basis[:, :count].T)
+    # The others follow the index.
+    follow = -np.linalg.solve(left.own, left.mixed @ slope)
+    whole = np.zeros((p + len(z), p + len(rows)))
+    whole[p:, p:] = logs
+    whole[:p, p:] = follow @ logs
+    whole[:p, :p] = np.linalg.inv(left.own)
     # A direction that nothing is known of keeps the widest error that still means anything.
     rest = np.full(len(z), WIDEST**2)
     rest[:count] = (1 / (1 + (scales * WIDEST) ** 2)) * WIDEST**2 / (1 + (scales * WIDEST) ** 2)
-    total = np.diag(rest)
-    total[:count, :count] += known
-    return right.T @ total @ right
+    spread = np.concatenate([follow, np.eye(len(z))]) @ right.T
+    return whole @ within @ whole.T + (spread * rest) @ spread.T
 
 
 def _line_figures(coefficients: Coefficients, z: Array) -> jax.Array:
@@ -1073,7 +1318,7 @@ def _verdict(end: Descent) -> tuple[bool, str]:
 
 
 def _nearest(
-    unknowns: Unknowns, z: np.ndarray, lin: Linearised, meat: np.ndarray
+    unknowns: Unknowns, z: np.ndarray, left: Eliminated, meat: np.ndarray
 ) -> tuple[tuple[str, float], ...]:
     """The five nearest glasses of the table, in standard deviations of what the picture tells."""
     fitted = np.asarray(unknowns.coefficients.index(z, unknowns.reference))
@@ -1083,7 +1328,7 @@ def _nearest(
     for name, glass in glass_table().items():
         if domain_error(glass, low, high):
             continue
-        off = lin.r @ unknowns.project @ (np.asarray(glass.indices(unknowns.reference)) - fitted)
+        off = left.r @ unknowns.project @ (np.asarray(glass.indices(unknowns.reference)) - fitted)
         found.append((name, float(np.sqrt(max(off @ spread @ off, 0.0)))))
     return tuple(sorted(found, key=lambda entry: entry[1])[:5])
 

@@ -1226,6 +1226,19 @@ def lane_radiance(
         Weighted radiance (J, S, P, channels), to be summed over the axes that the film sums; with
         one index for all samples they are summed already and S is 1.
     """
+    return followed_radiance(plan, indices, lanes)
+
+
+def followed_radiance(
+    plan: Plan, indices: tuple[Array, ...], lanes: Lanes
+) -> Float[Array, "wavelengths samples pixels channels"]:
+    """`lane_radiance`, for forward derivatives alone: those in the lanes need no path to its end.
+
+    Args:
+        plan: as in `lane_radiance`.
+        indices: as in `lane_radiance`.
+        lanes: as in `lane_radiance`.
+    """
     return _radiance(plan, indices, lanes, _until_done)
 
 

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from diffdisp.color import encode_srgb
 from diffdisp.dispersion import Sellmeier
-from diffdisp.fitting import FitResult
+from diffdisp.fitting import FitResult, FreeValue
 from diffdisp.glasses import named_glass
 from diffdisp.image import Picture, linear_rgb, replacing
 
@@ -72,6 +72,10 @@ def fit_json(result: FitResult) -> dict[str, Any]:
             {"name": name, "distance": _plain(distance)}
             for name, distance in result.nearest_glasses
         ],
+        "free": [
+            {"name": name, "value": _plain(value), "std": _plain(std)}
+            for name, value, std in result.free
+        ],
     }
 
 
@@ -112,11 +116,13 @@ def result_table(result: FitResult) -> str:
         ("V_d", _with_error(result.V_d, result.V_d_std)),
         ("P_gF", _with_error(result.P_gF, result.P_gF_std)),
         *_coefficient_rows(result),
+        *_free_rows(result),
         ("determined", f"{result.determined} of {len(result.singular_values)} directions"),
         ("nearest", _nearest(result)),
         ("residual", f"{result.rms_residual:.3g} rms"),
     ]
-    table = "\n".join(f"{name:<11}{text}" for name, text in rows)
+    width = max(11, *(len(value.name) + 2 for value in result.free), 0)
+    table = "\n".join(f"{name:<{width}}{text}" for name, text in rows)
     return f"{table}\n\n{textwrap.fill(result.summary, 79)}"
 
 
@@ -132,6 +138,23 @@ def _coefficient_rows(result: FitResult) -> Iterator[tuple[str, str]]:
     ):
         for i, (value, error) in enumerate(zip(values, errors, strict=True), 1):
             yield f"{name}{i}{unit}", _coefficient(float(value), float(error))
+
+
+def _free_rows(result: FitResult) -> Iterator[tuple[str, str]]:
+    """A line for each number that was free beside B and C; one for all gains."""
+    gains = [value for value in result.free if value.name.startswith("gain[")]
+    for value in result.free:
+        if value not in gains:
+            yield value.name, _with_error(value.value, value.std)
+    if gains:
+        low, high = (
+            _with_error(g.value, g.std) for g in (min(gains, key=_of), max(gains, key=_of))
+        )
+        yield "gain", low if len(gains) == 1 else f"{low} to {high}"
+
+
+def _of(value: FreeValue) -> float:
+    return value.value
 
 
 def _coefficient(value: float, error: float) -> str:

@@ -1,0 +1,152 @@
+"""Whether the errors that a fit reports are true: many pictures that differ by their noise alone.
+
+The pictures show the bench, drawn with so many samples that their own error is far below the
+noise. A deviation over the reported standard deviation, z, should then have a standard deviation
+of 1, and 68 % of them should lie within 1.
+"""
+
+import argparse
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+from record import TARGET_GLASS, TARGET_SCENE, print_table, write_record
+
+from diffdisp import (
+    Dielectric,
+    Film,
+    FitResult,
+    Object,
+    Picture,
+    Scene,
+    Sphere,
+    band_middles,
+    fit,
+    load_scene,
+    named_glass,
+    render,
+    with_glass,
+)
+
+NOISE = 0.01
+"""Of the radiance; the brightest tiles have 1."""
+TRUE_SAMPLES = 1024
+"""Of the pictures before noise."""
+TRUE = {"center": (0.013, -0.021, 0.03), "radius": 1.012, "gain": 1.1}
+"""Of the ball and the exposure where they are free; fits start at 0, 1 and 1."""
+
+Noise = Callable[[np.ndarray, np.random.Generator], np.ndarray]
+
+
+def even(radiance: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """The same noise everywhere."""
+    return generator.normal(0.0, NOISE, radiance.shape)
+
+
+def on_edges(radiance: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """Noise in proportion to the local gradient, as of a picture that is not quite sharp."""
+    down, across = np.gradient(radiance, axis=(0, 1))
+    steepness = np.hypot(down, across)
+    return even(radiance, generator) * steepness / np.sqrt(np.mean(steepness**2))
+
+
+@dataclass(frozen=True)
+class Case:
+    """A kind of picture, and how it is fitted."""
+
+    name: str
+    noise: Noise
+    given: float | None
+    free: tuple[str, ...]
+
+
+CASES = (
+    Case("even noise, given", even, NOISE, ()),
+    Case("even noise, unknown", even, None, ()),
+    Case("noise on edges, unknown", on_edges, None, ()),
+    Case("center, radius, gain free", even, NOISE, ("ball.center", "ball.radius", "gain")),
+)
+
+
+def displaced(scene: Scene) -> Scene:
+    """The bench with its ball as `TRUE` says."""
+    ball, *others = scene.objects
+    assert isinstance(ball.material, Dielectric)
+    shape = Sphere(TRUE["center"], TRUE["radius"])
+    return Scene(scene.camera, (Object(shape, ball.material, "ball"), *others), scene.background)
+
+
+def scores(result: FitResult) -> dict[str, list[float]]:
+    """Deviations from the truth over the reported standard deviations."""
+    with jax.enable_x64(True):
+        glass = named_glass(TARGET_GLASS)
+        n_d, V_d = float(glass.n_d), float(glass.V_d)
+        n = np.asarray(glass.indices(result.wavelengths))
+    true = {f"ball.center.{axis}": x for axis, x in zip("xyz", TRUE["center"], strict=True)}
+    true["ball.radius"] = TRUE["radius"]
+    return {
+        "n_d": [(result.n_d - n_d) / result.n_d_std],
+        "V_d": [(result.V_d - V_d) / result.V_d_std],
+        "n": list((result.n - n) / result.n_std),
+        "free": [(f.value - true.get(f.name, TRUE["gain"])) / f.std for f in result.free],
+    }
+
+
+def calibrate(case: Case, film: Film, repeats: int) -> list[dict[str, Any]]:
+    """Figures of the z-scores of one case."""
+    start = load_scene(str(TARGET_SCENE))
+    shown = with_glass(start, 0, named_glass(TARGET_GLASS))
+    shown = displaced(shown) if case.free else shown
+    picture = render(shown, film, samples=TRUE_SAMPLES, dtype="float64")
+    clean = np.asarray(picture) * (TRUE["gain"] if case.free else 1.0)
+    found: dict[str, list[float]] = {"n_d": [], "V_d": [], "n": [], "free": []}
+    failed, errors, seconds = 0, [], []
+    for seed in range(repeats):
+        noisy = clean + case.noise(clean, np.random.default_rng(seed))
+        begun = time.perf_counter()
+        result = fit(start, Picture(noisy, film.wavelengths), free=case.free, noise=case.given)
+        seconds.append(time.perf_counter() - begun)
+        failed += not result.converged
+        errors.append(result.n_d_std)
+        for name, values in scores(result).items():
+            found[name] += values
+        if sys.stderr.isatty():
+            print(f"{case.name}: {seed + 1} of {repeats}", file=sys.stderr)
+    return [
+        {
+            "case": case.name,
+            "of": name,
+            "mean": float(np.mean(z)),
+            "std": float(np.std(z)),
+            "within_1": float(np.mean(np.abs(z) < 1)),
+            "n_d_std": statistics.median(errors),
+            "fits": repeats,
+            "failed": failed,
+            "fit_s": statistics.median(seconds),
+        }
+        for name, z in found.items()
+        if z
+    ]
+
+
+def main() -> None:
+    """Measure, print, record."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    add = parser.add_argument
+    add("--repeats", type=int, default=200, help="fits of each case")
+    add("--size", type=int, default=48, help="pixels along each edge")
+    add("--bands", type=int, default=8, help="equal ones from 400 to 700 nm")
+    options = parser.parse_args()
+    film = Film(options.size, options.size, band_middles(400.0, 700.0, options.bands))
+    rows = [row for case in CASES for row in calibrate(case, film, options.repeats)]
+    print_table(list(rows[0]), [list(row.values()) for row in rows])
+    write_record("calibration", vars(options) | {"noise": NOISE}, {"scores": rows})
+
+
+if __name__ == "__main__":
+    main()
