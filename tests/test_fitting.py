@@ -392,6 +392,19 @@ def test_place_size_and_exposure_are_found_with_the_glass():
     assert known.n_d_std < result.n_d_std / 5
 
 
+def test_place_and_size_from_a_picture_that_does_not_say_how_it_was_drawn():
+    film = Film(32, 32, VISIBLE.wavelengths)
+    clean = render(displaced(BK7), film, samples=256, dtype="float64")
+    noisy = with_noise(Picture(np.asarray(clean), film.wavelengths), 11)
+    result = fit(bench(SILICA), noisy, free=("ball.center", "ball.radius"), noise=NOISE)
+    assert result.converged, result.message
+    assert result.samples == (16, 16, 64)
+    # As above.
+    for name, value, std in result.free:
+        assert abs(value - FREE_TRUTH[name]) < 4 * std, (name, value, std)
+    assert abs(result.n_d - float(BK7.n_d)) < 4 * result.n_d_std < 0.02
+
+
 def test_a_colour_picture_of_another_exposure(color):
     exposed = replace(color, radiance=color.radiance * np.array([0.5, 0.6, 0.7]))
     result = fit(bench(SILICA), exposed, free=("gain",))
