@@ -386,6 +386,7 @@ def test_place_size_and_exposure_are_found_with_the_glass():
     shape = result.scene.objects[0].shape
     assert [*shape.center, shape.radius] == [value.value for value in result.free[:4]]
     assert "and with ball.center and ball.radius and gain and black free" in result.summary
+    assert "these errors are too small" in result.summary
     # What is not known costs: with all the rest known the same noise leaves a tenth of that error.
     known = fit(displaced(SILICA), with_noise(clean, 6, 1e-3), noise=1e-3)
     assert known.free == ()
