@@ -339,6 +339,14 @@ def test_a_ball_outside_the_view_is_no_fit(visible):
     assert "no pixel of the picture depends on this glass" in result.message
 
 
+def test_a_ball_outside_a_picture_that_does_not_say_how_it_was_drawn_is_no_fit():
+    behind = Scene(camera(), (ball(SILICA, (0.0, 0.0, 20.0), name="ball"), screen()))
+    dark = np.full((SIZE, SIZE, 8), 0.5)
+    result = fit(behind, Picture(dark, VISIBLE.wavelengths))
+    assert not result.converged
+    assert "no pixel of the picture depends on this glass" in result.message
+
+
 def test_a_picture_of_another_scene_is_no_fit(visible):
     tiles = Scene(camera(), (ball(BK7, name="ball"), screen(even=1.0, odd=0.1)))
     result = fit(bench(SILICA), own_target(tiles, VISIBLE))

@@ -434,7 +434,8 @@ def fit(
         free: what is not known well beside the glass and is fitted too, from its value in the
             scene: numbers of the scene by name, such as "ball.center", "ball.center.z",
             "screen.tile" or "camera.vertical_fov"; "gain", a factor for each channel of the
-            picture; "black", what is added to all of them. Errors hold for not knowing them.
+            picture; "black", what is added to all of them. They enter the errors of the glass;
+            with numbers of the scene free all errors are too small, as the summary says.
         prior: "none"; "catalogue", a Gaussian in log B, log C over the table's glasses;
             "fixed-c3", which holds C₃ at its start.
         noise: standard deviation of the target's values where it is known; otherwise errors are
@@ -620,7 +621,9 @@ def _traced(
     """
     scene, spectrum, size, chunks, run = in_dtype((scene, spectrum, size, chunks, run), plan.dtype)
     indices = glass_indices(scene, spectrum.wavelengths)
-    at = (*indices[:ball], index, *indices[ball + 1 :])
+
+    def at(index: Array) -> tuple[Array, ...]:
+        return (*indices[:ball], index, *indices[ball + 1 :])
 
     def chunk(pixels: Pixels) -> Array:
         def lanes(coordinates: Array) -> Lanes:
@@ -628,11 +631,10 @@ def _traced(
             return chunk_lanes(plan, changed, spectrum, size, pixels, run)
 
         def of_scene(coordinates: Array) -> Array:
-            return combine(plan, followed_radiance(plan, at, lanes(coordinates)), spectrum)
+            return combine(plan, followed_radiance(plan, at(index), lanes(coordinates)), spectrum)
 
         def of_index(index: Array) -> Array:
-            changed = (*at[:ball], index, *at[ball + 1 :])
-            return combine(plan, lane_radiance(plan, changed, lanes(coordinates)), spectrum)
+            return combine(plan, lane_radiance(plan, at(index), lanes(coordinates)), spectrum)
 
         def change(tangent: Array) -> tuple[Array, Array]:
             return jax.jvp(of_index, (index,), (tangent,))
@@ -938,7 +940,9 @@ def _refined(problem: Problem, few: Descent, level: Level, depth: int) -> tuple[
     error = np.max(np.abs(some.picture - few.lin.picture), axis=1, keepdims=True) / 3
     error[hard] /= SPLITS[1] ** 2 / SPLITS[0] ** 2
     residual = np.abs(some.picture - level.target)[some.weight > 0]
-    sigma = max(1.4826 * float(np.median(residual)) if residual.size else 0.0, 1e-300)
+    # 1.4826 median deviations of normal noise are its standard deviation.
+    median = float(np.median(residual)) if residual.size else 0.0
+    sigma = max(1.4826 * median, CLEAN * problem.free.brightest)
     weights = 1 / (1 + (error / sigma) ** 2)
     if problem.free.parameters:
         weights *= _resolved(problem, few.lin.columns, some.columns)
@@ -1132,7 +1136,7 @@ def _fit(problem: Problem, target: Picture, prior: str, noise: float | None) -> 
     error = best.lin.noise / max(float(np.max(np.abs(best.lin.eliminated().r))), 1e-300)
     if NEGLECTED * CUTOFF > SMALL_STEP * error:
         # So clean a picture shows the light of the paths that were ended early.
-        exact = _descend(problem, level, best.at, 0.0, 30, SMALL_STEP)
+        exact = _descend(problem, level, best.at, 0.0, 30, SMALL_STEP, along)
         best = exact._replace(steps=best.steps + exact.steps)
     said = {"samples": target.samples, "depth": target.depth, "seed": target.seed}
     own = ", ".join(f"{name} {value}" for name, value in said.items() if value is not None)
