@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from diffdisp.color import encode_srgb
 from diffdisp.dispersion import Sellmeier
-from diffdisp.fitting import FitResult, FreeValue
+from diffdisp.fitting import FitResult
 from diffdisp.glasses import named_glass
 from diffdisp.image import Picture, linear_rgb, replacing
 
@@ -121,7 +121,7 @@ def result_table(result: FitResult) -> str:
         ("nearest", _nearest(result)),
         ("residual", f"{result.rms_residual:.3g} rms"),
     ]
-    width = max(11, *(len(value.name) + 2 for value in result.free), 0)
+    width = max([11, *(len(value.name) + 2 for value in result.free)])
     table = "\n".join(f"{name:<{width}}{text}" for name, text in rows)
     return f"{table}\n\n{textwrap.fill(result.summary, 79)}"
 
@@ -147,14 +147,9 @@ def _free_rows(result: FitResult) -> Iterator[tuple[str, str]]:
         if value not in gains:
             yield value.name, _with_error(value.value, value.std)
     if gains:
-        low, high = (
-            _with_error(g.value, g.std) for g in (min(gains, key=_of), max(gains, key=_of))
-        )
+        gains.sort(key=lambda gain: gain.value)
+        low, high = (_with_error(gain.value, gain.std) for gain in (gains[0], gains[-1]))
         yield "gain", low if len(gains) == 1 else f"{low} to {high}"
-
-
-def _of(value: FreeValue) -> float:
-    return value.value
 
 
 def _coefficient(value: float, error: float) -> str:
