@@ -238,22 +238,23 @@ def _wavefront_pass(
 ) -> Float[np.ndarray, "height width channels"]:
     """One pass by the wavefront loop."""
     plan, edge = work.plan, tile_edge(work.plan.samples)
-    rows, columns = -(-film.height // edge), -(-film.width // edge)
-    picture = np.empty((rows, edge, columns, edge, film.channels), plan.dtype)
-    picture[...] = _background(work.scene, spectrum)
+    row = np.tile(_background(work.scene, spectrum).astype(plan.dtype), film.width)
+    picture = np.empty((film.height, film.width, film.channels), plan.dtype)
+    picture.reshape(film.height, -1)[...] = row
     calls = _calls(work, film, spectrum, run)
 
     def one(call: _Call) -> None:
         part = call.arguments[-1]
-        shown = np.asarray(trace(*call.arguments))[: part.filled]
-        across, down = part.x[: part.filled] // edge, part.y[: part.filled] // edge
-        picture[down, :, across, :, call.channels] = shown.reshape(-1, edge, edge, shown.shape[-1])
+        tiles = np.asarray(trace(*call.arguments)).reshape(len(part.x), edge, edge, -1)
+        # Tile by tile: one assignment for all of them takes ten times as long.
+        for x, y, tile in zip(part.x[: part.filled], part.y, tiles, strict=False):
+            place = picture[y : y + edge, x : x + edge, call.channels]
+            place[...] = tile[: place.shape[0], : place.shape[1]]
 
     if calls:
         trace = _trace_program(plan, calls[0].arguments)
         in_threads(one, calls, plan.dtype, progress, alone=0)
-    whole = picture.reshape(rows * edge, columns * edge, film.channels)
-    return np.ascontiguousarray(whole[: film.height, : film.width])
+    return picture
 
 
 class _Call(NamedTuple):

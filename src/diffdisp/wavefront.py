@@ -236,7 +236,10 @@ def _in_view(
     # Both cones meet where the angle between their axes is at most the sum of their own.
     widest = cosine * np.sqrt(1 - sine**2) - np.sqrt(1 - cosine**2) * sine
     behind = np.arccos(cosine) + np.arcsin(sine) >= np.pi
-    return around | behind | (axis @ offset.T >= distance * (widest - 1e-6))
+    # BLAS would share this out to threads of its own, which then keep the cores busy for as long
+    # as a small picture takes.
+    along = np.einsum("ti,si->ts", axis, offset)
+    return around | behind | (along >= distance * (widest - 1e-6))
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
