@@ -4,8 +4,16 @@ import numpy as np
 import pytest
 from helpers import numbers
 
-from diffdisp.geometry import Ray, first_distance, plane_axes, plane_distance, sphere_distances
-from diffdisp.vector import Vec3, vec3
+from diffdisp.geometry import (
+    Ray,
+    first_distance,
+    mean_root,
+    plane_axes,
+    plane_distance,
+    sphere_depth,
+    sphere_distances,
+)
+from diffdisp.vector import Vec3, normalize, vec3
 
 RNG = np.random.default_rng(1)
 BESIDE = Vec3(*jnp.array([0.0, 0.0, -5.0]))
@@ -341,3 +349,35 @@ def test_axes_as_defined(normal):
 def test_gradients_of_the_axes_are_finite(normal):
     slopes = jax.jacrev(lambda n: plane_axes(vec3(n)))(jnp.array(normal))
     assert all(np.isfinite(slope).all() for slope in jax.tree.leaves(slopes))
+
+
+@pytest.mark.parametrize("width", [1e-6, 0.01, 0.3])
+def test_mean_root_is_that_of_a_box(width):
+    middle = width * np.linspace(-0.49, 3, 50)
+    points = middle[:, None] + width * ((np.arange(4000) + 0.5) / 4000 - 0.5)
+    expected = np.sqrt(np.maximum(points, 0)).mean(axis=1)
+    found = jax.vmap(mean_root, (0, None))(middle, jnp.asarray(width))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5 * np.sqrt(width))  # of the sum
+    slope = jax.vmap(jax.grad(mean_root), (0, None))(middle, jnp.asarray(width))
+    assert np.isfinite(slope).all()
+
+
+def test_depth_of_a_line_in_a_sphere_and_its_changes():
+    center, radius = vec3(jnp.array([0.1, -0.2, 0.3])), jnp.array(0.7)
+    there = Ray(vec3(jnp.array([2.0, 0.3, 0.1])), normalize(vec3(jnp.array([-1.0, -0.2, 0.2]))))
+    still = vec3(jnp.zeros(3))
+    # A direction's change is at right angles to it.
+    turn = there.direction.cross(vec3(jnp.array([0.0, 0.0, 0.01])))
+    footprint = Ray(vec3(jnp.array([0.01, 0.02, 0])), still), Ray(still, turn)
+    along, depth, edges = sphere_depth(there, footprint, center, radius)
+
+    def exact(ray):
+        """From the area of the parallelogram that spans the distance to the line."""
+        across = (ray.origin - center).cross(ray.direction)
+        return 1 - across.dot(across) / ray.direction.dot(ray.direction) / radius**2
+
+    np.testing.assert_allclose(depth, exact(there), rtol=1e-14)
+    np.testing.assert_allclose(along, (center - there.origin).dot(there.direction), rtol=1e-14)
+    for edge, found in zip(footprint, edges, strict=True):
+        _, expected = jax.jvp(exact, (there,), (edge,))
+        np.testing.assert_allclose(found, expected, rtol=1e-12)

@@ -13,6 +13,7 @@ from helpers import (
     camera,
     furnace,
     glass_of_index,
+    ground,
     incidence_on_unit_ball,
     lamp,
     reflectance,
@@ -396,6 +397,69 @@ def test_derivatives_in_the_geometry_are_finite_with_outlines_in_view():
         assert np.isfinite(POSE_PUSH(wide, tangent(which))).all()
     pulled = POSE_PULL(wide, jnp.ones(BANDS_SHAPE))
     assert all(np.isfinite(leaf).all() for leaf in pulled)
+
+
+FOCAL = 12 / np.tan(np.radians(17))
+"""Of a film of 24 pixels and a field of view of 34 degrees, pixels."""
+
+
+def summed(scene):
+    """The sum of a small picture's pixels."""
+    return jnp.sum(render(scene, Film(24, 24, wavelengths=[0.5]), samples=4))
+
+
+def test_a_lamp_grows_smoothly_by_its_outline():
+    def light(radius):
+        return summed(Scene(camera(), (Object(Sphere([0.0, 0, 0], radius), Emitter([1.0] * 3)),)))
+
+    found, slope = jax.jit(jax.value_and_grad(light))(jnp.array(0.6))
+    # A sphere of angle α around the axis is a disc of radius f tan α, sin α = r / d.
+    sine = 0.6 / 4
+    expected = np.pi * FOCAL**2 * sine**2 / (1 - sine**2)
+    growth = 2 * np.pi * FOCAL**2 * sine / 4 / (1 - sine**2) ** 2
+    # Straight edges for a circle of six pixels, in cells of half a pixel.
+    np.testing.assert_allclose(found, expected, rtol=2e-3)
+    np.testing.assert_allclose(slope, growth, rtol=1e-2)
+
+
+def test_a_horizon_sinks_smoothly_as_the_camera_looks_up():
+    ground_of = ground(Emitter([1.0] * 3))
+
+    def light(up):
+        look_at = jnp.zeros(3).at[1].set(up)
+        return summed(Scene(Camera([0.0, 0, 4], look_at, vertical_fov=34.0), (ground_of,)))
+
+    found, slope = jax.jit(jax.value_and_grad(light))(jnp.array(0.1))
+    # What is level is f tan α below the middle, tan α = 0.1 / 4.
+    np.testing.assert_allclose(found, 24 * (12 - FOCAL * 0.1 / 4), rtol=1e-3)
+    np.testing.assert_allclose(slope, -24 * FOCAL / 4, rtol=1e-3)
+
+
+def test_a_lamp_before_a_lamp_hides_it_by_its_part():
+    def light(radius):
+        near = Object(Sphere([0.0, 0, 1], radius), Emitter([0.25] * 3))
+        far = Object(Sphere([0.0, 0, -2], 3.0), Emitter([1.0] * 3))
+        return summed(Scene(camera(), (far, near)))
+
+    slope = jax.jit(jax.grad(light))(jnp.array(0.6))
+    sine = 0.6 / 3
+    growth = 2 * np.pi * FOCAL**2 * sine / 3 / (1 - sine**2) ** 2
+    np.testing.assert_allclose(slope, -0.75 * growth, rtol=1e-2)  # as for the lamp alone
+
+
+def test_outlines_seen_through_a_ball_move_with_its_index():
+    lamp_of = Object(Sphere([0.25, 0.2, -3.0], 0.5), Emitter([1.0] * 3))
+
+    def picture(n, samples):
+        glass = Sellmeier(jnp.zeros(3).at[0].set(n * n - 1), jnp.zeros(3))
+        scene = Scene(camera(), (Object(Sphere([0.0, 0, 0], 1.0), Dielectric(glass)), lamp_of))
+        return render(scene, Film(16, 16, wavelengths=[0.5]), samples=samples)
+
+    slope = jax.jit(lambda n: jax.jvp(lambda n: picture(n, 16), (n,), (jnp.ones(()),))[1])(1.5)
+    # Of so many samples a step crosses several of each pixel on the outline.
+    sharp = jax.jit(lambda n: picture(n, 900))
+    difference = (sharp(1.502) - sharp(1.498)) / 0.004
+    assert np.linalg.norm(slope - difference) < 0.05 * np.linalg.norm(difference)
 
 
 def scenes():

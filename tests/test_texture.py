@@ -3,7 +3,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from diffdisp.texture import Checker, Checker2D, Solid, as_texture, filtered_square_wave
+from diffdisp.texture import (
+    Checker,
+    Checker2D,
+    Solid,
+    as_texture,
+    covered,
+    filtered_checker,
+    filtered_square_wave,
+)
 
 RNG = np.random.default_rng(2)
 WAVE = jax.jit(jax.vmap(filtered_square_wave))
@@ -120,6 +128,53 @@ def test_float32_keeps_its_digits(low, high, least_ratio):
         found = WAVE(*where)
     assert found.dtype == np.float32
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5)  # a fortieth of an 8-bit step
+
+
+GRID = (np.arange(400) + 0.5) / 400 - 0.5
+
+
+def over_parallelogram(of, where):
+    """Mean of `of(coordinate, ...)` over 400 x 400 points of parallelograms of 2 or 3 axes."""
+    middle, across, down = (np.asarray(part) for part in where)
+    s, t = np.meshgrid(GRID, GRID)
+    return np.array(
+        [
+            of(*(m + a * s + d * t for m, a, d in zip(*one, strict=True))).mean()
+            for one in zip(middle.T, across.T, down.T, strict=True)
+        ]
+    )
+
+
+def parallelograms(axes, low, high, count=60):
+    """Random middles, edges across and down, (axes, count) each."""
+    middle = RNG.uniform(-4, 4, (axes, count))
+    edges = np.exp(RNG.uniform(np.log(low), np.log(high), (2, axes, count)))
+    return middle, *(edges * RNG.choice([-1, 1], edges.shape))
+
+
+@pytest.mark.parametrize("axes", [2, 3])
+@pytest.mark.parametrize(("low", "high"), [(1e-3, 0.05), (0.05, 0.3)], ids=str)
+def test_mean_of_tiles_around_their_corners(axes, low, high):
+    middle, across, down = parallelograms(axes, low, high)
+    middle[:2] = np.round(middle[:2]) + RNG.uniform(-0.3, 0.3, (2, 60)) * high
+    middle[2:] = np.round(middle[2:]) + 0.5  # a corner of all three is not represented
+    found = jax.jit(jax.vmap(lambda *where: filtered_checker(*where)))(
+        tuple(middle), tuple(across), tuple(down)
+    )
+    expected = over_parallelogram(
+        lambda *x: np.prod([hard_wave(part) for part in x], axis=0), (middle, across, down)
+    )
+    np.testing.assert_allclose(found, expected, rtol=0, atol=0.01)  # of the sum: 2/400 an edge
+    apart = np.prod([WAVE(*axis) for axis in zip(middle, across, down, strict=True)], axis=0)
+    assert np.abs(apart - expected).max() > 0.2  # without its correlation a corner is far off
+
+
+def test_what_is_covered_of_a_footprint():
+    distance, across, down = (part[0] for part in parallelograms(1, 0.1, 3))
+    found = jax.vmap(covered)(distance, across, down)
+    expected = over_parallelogram(lambda x: x > 0, (distance[None], across[None], down[None]))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=3e-3)  # of the sum: 1/400
+    assert ((expected > 0) & (expected < 1)).sum() > 10
 
 
 def test_three_numbers_are_a_solid():

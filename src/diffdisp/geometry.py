@@ -84,6 +84,97 @@ def first_distance(ray: Ray, center: Vec3, radius: Real, on: Array) -> tuple[Rea
     return distance, (discriminant > 0) & (distance > 0)
 
 
+def sphere_depth(
+    ray: Ray, footprint: tuple[Ray, Ray], center: Vec3, radius: Real
+) -> tuple[Real, Real, tuple[Real, Real]]:
+    """How deep a ray's line goes into a sphere, and what the edges of a footprint add to that.
+
+    Args:
+        ray: the ray.
+        footprint: its changes along both edges of a footprint.
+        center: the sphere's.
+        radius: the sphere's.
+
+    Returns:
+        Distance along the ray to the line's point next to the centre. The line's depth there, 1
+        minus the square of its distance from the centre in radii: below 0 it misses the sphere,
+        else its cosine to the sphere is the square root. And the changes of the depth along both
+        edges.
+    """
+    to_origin = ray.origin - center
+    along = -to_origin.dot(ray.direction)
+    foot, squared = to_origin + ray.direction * along, radius * radius
+    across, down = (
+        -2.0 * foot.dot(edge.origin + edge.direction * along) / squared for edge in footprint
+    )
+    return along, (squared - foot.dot(foot)) / squared, (across, down)
+
+
+def box_width(edges: tuple[Real, Real]) -> Real:
+    """Width of a box of the variance that a sum of two boxes has, of the widths `edges`."""
+    across, down = edges
+    # A hypotenuse has no derivative at zero.
+    return safe_sqrt(across * across + down * down, 1e-30)
+
+
+def mean_root(middle: Real, width: Real) -> Real:
+    """Mean of √x, and of 0 where x is negative, over a box; its derivatives are finite.
+
+    Args:
+        middle: of the box, more than half of the width below 0 at most.
+        width: of the box, ≥ 0.
+    """
+    half = 0.5 * width
+    least = least_square(middle)
+    high, low = safe_sqrt(middle + half, least), safe_sqrt(middle - half, least)
+    whole = middle > half
+    total = jnp.where(high > 0, high + low, 1.0)
+    # ∫√x as a difference of cubes over one of squares, without what both have in common.
+    inside = (high * high + high * low + low * low) * (2.0 / 3.0) / total
+    cut = high * high * high / (3.0 * jnp.where(whole | (half == 0), 1.0, half))
+    return jnp.where(whole, inside, cut)
+
+
+def ball_offset(
+    ray: Ray,
+    center: Vec3,
+    radius: Real,
+    width: Real,
+    nested: bool,
+    inside: Array | bool,
+) -> Vec3:
+    """From a ball's centre to where a ray meets it, if it is known to meet it next.
+
+    Next to its silhouette a ball turns away within less than a footprint. The point is then the
+    mean of where the footprint meets the ball, and of where the part of it that passes beside
+    the ball comes nearest: reflectance and directions are linear in the cosine so near to
+    grazing, so that what is seen from there is the mean of what is seen. It moves with the ball
+    as smoothly. It lies on the ray, and a little off the ball; the path then goes on as in a ball
+    on which it lies.
+
+    Args:
+        ray: the ray.
+        center: the ball's.
+        radius: the ball's.
+        width: of a box in which the depth of `sphere_depth` has the variance that it has over
+            the footprint.
+        nested: whether the ray may begin inside of the ball though it is not known to.
+        inside: whether the ray begins on the ball and goes through it.
+    """
+    to_origin = ray.origin - center
+    along = -to_origin.dot(ray.direction)
+    across = to_origin + ray.direction * (2.0 * along)
+    if inside is True:
+        return across
+    foot = to_origin + ray.direction * along
+    depth = (radius * radius - foot.dot(foot)) / (radius * radius)
+    cosine = mean_root(depth, width)
+    if nested:
+        within = to_origin.dot(to_origin) < radius * radius
+        cosine = jnp.where(within, -safe_sqrt(depth, least_square(depth)), cosine)
+    return choose(inside, across, foot - ray.direction * (radius * cosine))
+
+
 def plane_distance(ray: Ray, point: Vec3, normal: Vec3) -> Real:
     """Distance along the ray to a plane; -1 where they are parallel."""
     cosine = ray.direction.dot(normal)

@@ -23,17 +23,30 @@ from diffdisp.geometry import (
     Plane,
     Ray,
     Sphere,
+    ball_offset,
+    box_width,
     first_distance,
     plane_axes,
     plane_distance,
+    sphere_depth,
     sphere_distances,
 )
 from diffdisp.material import Dielectric, Emitter, Lambertian, Material, Metal
 from diffdisp.planning import Plan
 from diffdisp.sampling import Numbers, uniform_direction
 from diffdisp.scene import Object, Scene, is_glass, texture_of
-from diffdisp.texture import Checker, Solid, filtered_square_wave
-from diffdisp.vector import Array, Real, Vec3, choose, module_of, normalize, vec3
+from diffdisp.texture import Checker, Solid, covered, filtered_checker
+from diffdisp.vector import (
+    Array,
+    Real,
+    Vec3,
+    choose,
+    least_square,
+    module_of,
+    normalize,
+    safe_sqrt,
+    vec3,
+)
 
 
 class World(NamedTuple):
@@ -215,7 +228,14 @@ def all_spheres(world: World, plan: Plan, one: Array | None) -> Candidates:
     )
 
 
-def nearest(ray: Ray, world: World, plan: Plan, last: Array, spheres: Candidates) -> Array:
+def nearest(
+    ray: Ray,
+    world: World,
+    plan: Plan,
+    last: Array,
+    spheres: Candidates,
+    footprint: tuple[Ray, Ray] | None = None,
+) -> Array:
     """Number of the surface that a ray meets first.
 
     Args:
@@ -225,8 +245,11 @@ def nearest(ray: Ray, world: World, plan: Plan, last: Array, spheres: Candidates
         last: number of the surface on which the ray starts, -1 for none. Its own distance of
             zero is divided out, so that no offset is needed to leave it.
         spheres: those that the ray can meet.
+        footprint: of the ray, where a part of it that meets a glass ball counts as meeting it.
     """
-    ray, world, centers, radii = jax.lax.stop_gradient((ray, world, spheres.centers, spheres.radii))
+    ray, world, centers, radii, footprint = jax.lax.stop_gradient(
+        (ray, world, spheres.centers, spheres.radii, footprint)
+    )
     word = jnp.int64 if plan.dtype == "float64" else jnp.int32
     rows = np.asarray((1 << max(spheres.group - 1, 0).bit_length()) - 1, word)
 
@@ -241,7 +264,13 @@ def nearest(ray: Ray, world: World, plan: Plan, last: Array, spheres: Candidates
         for row in range(spheres.group):
             place = group * spheres.group + row
             center, radius = _pick_vector(centers, place), radii[place]
-            distance, meets = first_distance(ray, center, radius, spheres.numbers[place] == last)
+            number = spheres.numbers[place]
+            distance, meets = first_distance(ray, center, radius, number == last)
+            if footprint is not None and plan.balls:
+                along, depth, edges = sphere_depth(ray, footprint, center, radius)
+                grazes = (depth <= 0) & (depth + 0.5 * box_width(edges) > 0) & (along > 0)
+                grazes = grazes & (number < plan.balls) & (number != last)
+                distance, meets = jnp.where(grazes, along, distance), meets | grazes
             far = jnp.where(meets, distance, jnp.inf)
             words.append((jax.lax.bitcast_convert_type(far, word) & ~rows) | np.asarray(row, word))
         return reduce(jnp.minimum, words)
@@ -373,7 +402,7 @@ def _is_odd(coordinates: tuple[Real, ...]) -> Array:
 def _filtered(coordinates: Callable[[Ray], tuple[Real, ...]], path: Path) -> Real:
     """The mean over a footprint of +1 in even and -1 in odd tiles."""
     values, edges = pushed(coordinates, path.ray, path.footprint)
-    return reduce(jnp.multiply, map(filtered_square_wave, values, *edges))
+    return filtered_checker(values, *edges)
 
 
 def _beneath(point: Vec3, outward: Vec3, surface: Array, tables: "Tables", plan: Plan) -> Vec3:
@@ -409,6 +438,99 @@ def emitted(
         return _beneath(where, outward, surface, tables, plan)
 
     return painted(surface, point, path, tables, plan, True, one)
+
+
+class Seen(NamedTuple):
+    """One of the surfaces that end paths, to a footprint.
+
+    Args:
+        distance: along the ray to where it is met, or passed next to.
+        part: of the footprint that meets it, were there nothing before it.
+        light: what it shows there.
+    """
+
+    distance: Real
+    part: Real
+    light: Channels
+
+
+def arriving(
+    surface: Array, path: Path, tables: "Tables", plan: Plan, one: Array | None
+) -> Channels:
+    """Mean radiance over a footprint whose middle meets a surface that ends paths.
+
+    Lamps end at their silhouettes and infinite screens at their horizons. Of a footprint across
+    such an edge each side counts by its part, the straight edge that touches the surface there
+    taken for it; of several, the nearer ones hide the others by their parts.
+    """
+    ends = plan.lamps + plan.screens
+    if path.footprint is None or not ends:
+        return emitted(surface, path, tables, plan, one)
+    # Behind all is the background; it starts to be hidden from the nearest one on.
+    background = plan.background - plan.balls + tables.first_row
+    seen = [_lamp_seen(row, path, tables, plan, one) for row in range(plan.lamps)]
+    seen += [_screen_seen(row, path, tables, plan, one) for row in range(plan.screens)]
+    total = tuple(jnp.zeros_like(mean[0]) for mean in tables.paint.mean)
+    rest = jnp.ones_like(path.ray.origin.x)
+    for number, found in enumerate(seen):
+        left = found.part
+        for other, before in enumerate(seen):
+            # Of two at the same distance the one with the lower number is the nearer.
+            nearer = before.distance < found.distance
+            if other < number:
+                nearer = before.distance <= found.distance
+            if other != number:
+                left = left * jnp.where(nearer, 1.0 - before.part, 1.0)
+        total = tuple(t + left * x for t, x in zip(total, found.light, strict=True))
+        rest = rest * (1.0 - found.part)
+    return tuple(
+        t + rest * _pick(mean, background) for t, mean in zip(total, tables.paint.mean, strict=True)
+    )
+
+
+def _lamp_seen(row: int, path: Path, tables: "Tables", plan: Plan, one: Array | None) -> Seen:
+    """A lamp; of a checker on it, a footprint that only grazes it sees the mean."""
+    world, number = tables.world, plan.first_lamp + row
+    center, radius = (
+        vec3_row(world.centers, plan.first_plane + row),
+        world.radii[plan.first_plane + row],
+    )
+    assert path.footprint is not None
+    along, depth, edges = sphere_depth(path.ray, path.footprint, center, radius)
+    root = radius * safe_sqrt(depth, least_square(depth))
+    offset = path.ray.origin - center
+    around = offset.dot(offset) < radius * radius
+    part = jnp.where(around, 1.0, jnp.where(along > 0, covered(depth, *edges), 0.0))
+    place = number - plan.balls + tables.first_row
+    light = tuple(_pick(mean, place) for mean in tables.paint.mean)
+    if plan.cubed[True]:
+        shown = emitted(_everywhere(number, depth), path, tables, plan, one)
+        light = tuple(jnp.where(depth > 0, x, m) for x, m in zip(shown, light, strict=True))
+    return Seen(along + jnp.where(around, root, -root), part, light)
+
+
+def _screen_seen(row: int, path: Path, tables: "Tables", plan: Plan, one: Array | None) -> Seen:
+    """A screen: all of the footprint up to its horizon, where its tiles are their mean."""
+    world, number = tables.world, plan.first_lamp + plan.lamps + row
+    plane = plan.planes - plan.screens + row
+    normal = vec3_row(world.normals, plane)
+    height = (path.ray.origin - vec3_row(world.points, plane)).dot(normal)
+    side = jnp.where(height < 0, 1.0, -1.0)
+
+    def towards(ray: Ray) -> Real:
+        return ray.direction.dot(normal) * side
+
+    downward, edges = pushed(towards, path.ray, path.footprint)
+    part = jnp.where(height == 0, 0.0, covered(downward, *edges))
+    meets = downward > 0
+    distance = jnp.where(meets, jnp.abs(height) / jnp.where(meets, downward, 1.0), jnp.inf)
+    light = emitted(_everywhere(number, height), path, tables, plan, one)
+    return Seen(distance, part, light)
+
+
+def _everywhere(number: int, like: Real) -> Array:
+    """The number of one surface, in the shape of `like`."""
+    return jnp.full(jnp.shape(like), number, jnp.int32)
 
 
 def _plane_row(surface: Array, plan: Plan) -> Array:
@@ -470,18 +592,17 @@ def start_path(
     else:
         ray, push = jax.linearize(through, *film_point)
         footprint = (push(zero + cell[0], zero), push(zero, zero + cell[1]))
-    surface = nearest(
-        ray, tables.world, plan, no_surface(zero), all_spheres(tables.world, plan, None)
-    )
+    spheres = all_spheres(tables.world, plan, None)
+    surface = nearest(ray, tables.world, plan, no_surface(zero), spheres, footprint)
     path = new_path(ray, footprint, surface, plan)
-    shown = emitted(surface, path, tables, plan, one)
+    shown = arriving(surface, path, tables, plan, one)
     ends = surface >= plan.first_lamp
     return path._replace(radiance=tuple(jnp.where(ends, channel, 0.0) for channel in shown))
 
 
 def no_surface(like: Real) -> Array:
     """The number -1, which no surface has."""
-    return jnp.full(jnp.shape(like), -1, jnp.int32)
+    return _everywhere(-1, like)
 
 
 def new_path(ray: Ray, footprint: tuple[Ray, Ray] | None, surface: Array, plan: Plan) -> Path:
@@ -649,9 +770,9 @@ def _both_ways(path: Path, setting: Setting, inside: Array | bool) -> Path:
 
     def arrive(way: Way, radiance: Channels) -> tuple[Array, Channels]:
         """The surface that a way meets, and the radiance with what that one adds."""
-        surface = nearest(way.ray, world, plan, ball, spheres)
-        arriving = path._replace(ray=way.ray, footprint=way.footprint)
-        light = emitted(surface, arriving, setting.tables, plan, setting.one)
+        surface = nearest(way.ray, world, plan, ball, spheres, way.footprint)
+        arrived = path._replace(ray=way.ray, footprint=way.footprint)
+        light = arriving(surface, arrived, setting.tables, plan, setting.one)
         factor = jnp.where(path.alive & (surface >= plan.first_lamp), throughput * way.share, 0.0)
         return surface, tuple(r + factor * x for r, x in zip(radiance, light, strict=True))
 
@@ -694,18 +815,21 @@ def _parting(path: Path, setting: Setting, inside: Array | bool) -> tuple[Way, W
     def stage(of: Callable[[Any], Any], value: Any, *edges: Any) -> tuple[Any, Any]:
         return once(lambda: pushed(of, value, edges), setting.one)
 
-    def normal(ray: Ray) -> Vec3:
-        distance = _distance_to_ball(ray, center, radius, plan, inside)
-        return normalize(ray.origin + ray.direction * distance - center)
+    width = box_width(sphere_depth(path.ray, path.footprint, center, radius)[2])
+
+    def meet(ray: Ray) -> tuple[Vec3, Vec3]:
+        offset = ball_offset(ray, center, radius, width, plan.nested, inside)
+        return offset, normalize(offset)
 
     old, changes = path.ray.direction, tuple(edge.direction for edge in path.footprint)
-    outward, turns = stage(normal, path.ray, *path.footprint)
-    point = center + outward * radius
+    (offset, outward), moves = stage(meet, path.ray, *path.footprint)
+    turns = tuple(turn for _, turn in moves)
     both_turn = tuple(zip(changes, turns, strict=True))
     cosine, tilts = stage(lambda vectors: vectors[0].dot(vectors[1]), (old, outward), *both_turn)
     # A border within glass, or a camera there, shows its side only here.
     leaves = cosine > 0 if plan.nested else inside
-    media = surface_indices(point, outward, ball, setting.index_of, world, plan)
+    on_ball = center + outward * radius
+    media = surface_indices(on_ball, outward, ball, setting.index_of, world, plan)
 
     def weights(cosine: Real) -> tuple[Real, ...]:
         """Of the outward normal in the mirrored direction, and in the bent one."""
@@ -728,9 +852,9 @@ def _parting(path: Path, setting: Setting, inside: Array | bool) -> tuple[Way, W
         mirrored, bent = old + outward * mirror, old * slower + outward * bend
         return choose(leaves, bent, mirrored), choose(leaves, mirrored, bent)
 
-    given, moves = (old, outward, both_weights), zip(changes, turns, weighed, strict=True)
-    (outer, inner), (across, down) = stage(directions, given, *moves)
-    at = tuple(turn * radius for turn in turns)
+    given, pushes = (old, outward, both_weights), zip(changes, turns, weighed, strict=True)
+    (outer, inner), (across, down) = stage(directions, given, *pushes)
+    point, at = center + offset, tuple(move for move, _ in moves)
 
     def way(direction: Vec3, number: int, share: Real) -> Way:
         footprint = Ray(at[0], across[number]), Ray(at[1], down[number])
@@ -753,18 +877,6 @@ def _go_on(
     return kept._replace(
         radiance=radiance, alive=alive, spectral=moved.spectral, reflected=moved.reflected
     )
-
-
-def _distance_to_ball(
-    ray: Ray, center: Vec3, radius: Real, plan: Plan, inside: Array | bool
-) -> Real:
-    """Distance to the ball that the path is known to meet next."""
-    across = -2.0 * (ray.origin - center).dot(ray.direction)
-    if inside is True:
-        return across
-    near, far, _ = sphere_distances(ray, center, radius)
-    ahead = jnp.where(near > 0, near, far) if plan.nested else near
-    return choose(inside, across, ahead)
 
 
 class Scattered(NamedTuple):
