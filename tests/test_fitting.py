@@ -361,6 +361,94 @@ def test_noise_alone_is_no_fit(visible):
     assert result.message
 
 
+# --- a mask
+
+
+def test_what_a_mask_leaves_out_is_not_seen(visible):
+    mask = np.ones((SIZE, SIZE), bool)
+    mask[:, : SIZE // 3] = False
+    results = []
+    for rubbish in (0.0, 9.0, np.nan):
+        radiance = with_noise(visible, 7).radiance
+        radiance[~mask] = rubbish
+        results.append(fit(bench(SILICA), replace(visible, radiance=radiance), mask=mask))
+    first = results[0]
+    assert first.converged, first.message
+    assert first.masked == SIZE * (SIZE // 3)
+    # Normal errors exceed 4 sigma once in 16 000.
+    assert abs(first.n_d - float(BK7.n_d)) < 4 * first.n_d_std
+    assert abs(first.V_d - float(BK7.V_d)) < 4 * first.V_d_std
+    # A standard deviation from 2640 values is known to 1.4 %; six polynomials are fitted.
+    assert abs(first.rms_residual / NOISE - 1) < 0.06
+    for other in results[1:]:
+        np.testing.assert_array_equal(other.n, first.n)
+        np.testing.assert_array_equal(other.covariance, first.covariance)
+    # The picture is whole, of the fitted glass: n is off by some 1e-4 in so noisy a picture.
+    assert first.picture.shape == visible.radiance.shape
+    assert np.max(np.abs(first.picture - visible.radiance)) < 0.05
+
+
+def test_what_two_halves_know_is_what_the_whole_knows(visible):
+    left = np.broadcast_to(np.arange(SIZE) < SIZE // 2, (SIZE, SIZE))
+    known = [
+        fit(bench(SILICA), visible, noise=NOISE, mask=mask).singular_values[0] ** 2
+        for mask in (None, left, ~left)
+    ]
+    # Information adds, and clean pictures end at the same coefficients. Only the best known
+    # direction turns a little from half to half.
+    assert known[1] + known[2] == pytest.approx(known[0], rel=0.02)
+
+
+def test_dead_pixels_all_over_do_not_hide_the_ball():
+    film = Film(70, 70, VISIBLE.wavelengths)
+    target = with_noise(own_target(bench(BK7), film), 9)
+    dead = np.random.default_rng(1).random((70, 70)) < 0.2
+    target.radiance[dead] = 5.0
+    # Blocks of 3 x 3 pixels are whole once in 0.8⁻⁹ = 7.5: the means of what is left have to do.
+    result = fit(bench(SILICA), target, mask=~dead)
+    assert result.converged, result.message
+    assert result.masked == np.sum(dead)
+    assert abs(result.n_d - float(BK7.n_d)) < 4 * result.n_d_std
+
+
+def test_a_mask_goes_with_a_picture_that_does_not_say_how_it_was_drawn():
+    film = Film(32, 32, VISIBLE.wavelengths)
+    clean = render(displaced(BK7), film, samples=256, dtype="float64")
+    noisy = with_noise(Picture(np.asarray(clean), film.wavelengths), 11)
+    mask = np.ones((32, 32), np.uint8)
+    mask[20:26, 10:20] = 0
+    noisy.radiance[mask == 0] = 3.0
+    free = ("ball.center", "ball.radius")
+    result = fit(bench(SILICA), noisy, free=free, noise=NOISE, mask=mask)
+    assert result.converged, result.message
+    assert result.samples == (16, 16, 64)
+    # As without a mask, in `test_place_and_size_from_a_picture_...`.
+    assert abs(result.n_d - float(BK7.n_d)) < 4 * result.n_d_std < 0.025
+
+
+def test_a_mask_that_shows_no_glass_is_no_fit(visible):
+    mask = np.zeros((SIZE, SIZE))
+    mask[0, 0] = 1
+    result = fit(bench(SILICA), visible, mask=mask)
+    assert not result.converged
+    assert "no pixel of the picture depends on this glass" in result.message
+
+
+@pytest.mark.parametrize(
+    ("mask", "words"),
+    [
+        (np.ones((2, 3)), r"mask \(2, 3\): must be \(2, 2\)"),
+        (np.ones((2, 2, 1)), r"mask \(2, 2, 1\): must be \(2, 2\)"),
+        (np.zeros((2, 2), bool), "mask: zero everywhere leaves nothing"),
+        (np.array([[1, 0], [1, 1]]), "target: 1 of its values are not finite"),
+    ],
+)
+def test_masks_that_do_not_fit_are_refused(mask, words):
+    radiance = np.array([[0.5, 0.5], [np.nan, 0.5]])[..., None]
+    with pytest.raises(ValueError, match=words):
+        fit(bench(), Picture(radiance, np.array([0.55])), mask=mask)
+
+
 # --- what else is free
 
 

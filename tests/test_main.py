@@ -330,6 +330,24 @@ def test_bad_fit(tmp_path, target, out, capsys, text, options, phrase):
     assert list(out.iterdir()) == []
 
 
+# Bad masks: the keys of an .npz file, and what the message must say.
+BAD_MASKS = {
+    "another size": ({"radiance": np.ones((8, 6, 3))}, "mask (8, 6): must be (6, 8)"),
+    "all zero": ({"radiance": np.zeros((6, 8, 3))}, "leaves nothing to fit"),
+    "no picture": ({"other": np.ones((6, 8))}, "it has no mask"),
+}
+
+
+@pytest.mark.parametrize(("keys", "phrase"), BAD_MASKS.values(), ids=BAD_MASKS)
+def test_bad_mask(scene, target, tmp_path, out, capsys, keys, phrase):
+    np.savez(tmp_path / "mask.npz", **keys)
+    arguments = ["fit", scene, target, "-o", str(out / "fit"), "--mask"]
+    refused(capsys, [*arguments, str(tmp_path / "mask.npz")], phrase)
+    refused(capsys, [*arguments, str(tmp_path / "nosuch.png")], "nosuch.png: there is no such")
+    refused(capsys, [*arguments, str(tmp_path / "mask.txt")], "a picture ends in one of")
+    assert list(out.iterdir()) == []
+
+
 @pytest.mark.parametrize(
     ("folder", "phrase"),
     [("file", "no folder"), ("file/fit", "no folder"), ("taken", "report.png: is a folder")],
@@ -694,6 +712,7 @@ def test_fit(scene, target, out, capsys, fitted):
     assert (fitted["object_name"], fitted["prior"], fitted["free"]) == (None, "none", [])
     assert fitted["noise"] is None
     assert fitted["start"] is None
+    assert fitted["mask"] is None
 
 
 def test_fit_options(scene, target, out, fitted):
@@ -703,6 +722,15 @@ def test_fit_options(scene, target, out, fitted):
     assert (fitted["object_name"], fitted["prior"], fitted["noise"]) == ("ball", "fixed-c3", 1e-3)
     assert fitted["start"].name == "F2"
     assert fitted["free"] == ["ball.center", "gain"]
+
+
+def test_fit_with_a_mask(scene, target, tmp_path, out, fitted):
+    mask = np.zeros((6, 8, 3), np.uint8)
+    mask[1:5, 2:6] = 255
+    iio.imwrite(tmp_path / "mask.png", mask)
+    options = ["--mask", str(tmp_path / "mask.png")]
+    assert main(["fit", scene, target, "-o", str(out), *options]) == 0
+    np.testing.assert_array_equal(fitted["mask"], mask[..., 0] > 0)
 
 
 def test_fit_that_does_not_converge(scene, target, out, capsys, fitted):

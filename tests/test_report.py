@@ -22,7 +22,7 @@ KEYS = {
     *("converged", "message", "steps", "B", "C", "B_std", "C_std", "covariance", "n_d"),
     *("n_d_std", "V_d", "V_d_std", "P_gF", "wavelength", "n", "n_std", "singular_values"),
     *("determined", "summary", "rms_residual", "nearest_glasses"),
-    *("object", "prior", "P_gF_std", "free"),
+    *("object", "prior", "P_gF_std", "free", "left_out"),
 }
 
 
@@ -177,6 +177,23 @@ def test_report_shows_the_residual(tmp_path):
     shifted = np.roll(blurred_ring(32, 16), 3, axis=1)
     write_report(tmp_path / "b.png", fake_result(picture=shifted), fake_target())
     assert (tmp_path / "a.png").read_bytes() != (tmp_path / "b.png").read_bytes()
+
+
+def test_what_a_mask_left_out_is_told_and_not_drawn(tmp_path):
+    used = np.ones((32, 32), bool)
+    assert fit_json(fake_result())["left_out"] == {"masked_pixels": 0}
+    assert "left out" not in result_table(fake_result())
+    used[4:8, 4:8] = False
+    result = fake_result(used=used)
+    assert fit_json(result)["left_out"] == {"masked_pixels": 16}
+    assert "left out   16 pixels by the mask\n" in result_table(result)
+    write_report(tmp_path / "a.png", result, fake_target())
+    # What a masked pixel holds changes neither the picture of the residual nor its scale.
+    spoiled = fake_target().radiance.copy()
+    spoiled[4:8, 4:8] = np.nan
+    write_report(tmp_path / "b.png", result, Picture(spoiled, BANDS))
+    drawn, again = (iio.imread(tmp_path / name)[:480, 1080:] for name in ("a.png", "b.png"))
+    np.testing.assert_array_equal(drawn, again)
 
 
 @pytest.mark.parametrize(

@@ -176,6 +176,9 @@ def _add_fit(parser: argparse.ArgumentParser) -> None:
     add("--prior", choices=PRIORS, default="none", help="what is known beforehand (default none)")
     add("--noise", type=_noise, metavar="SIGMA", help="of the radiance (default: estimated)")
     add("--start", metavar="GLASS", help="glass to start from (default: that of the scene)")
+    add(
+        "--mask", metavar="FILE", help="a picture of TARGET's size; where it is 0 nothing is fitted"
+    )
 
 
 _FREE_HELP = (
@@ -379,12 +382,13 @@ def _fit(options: argparse.Namespace) -> int:
     _check_folder(folder)
     from diffdisp.fitting import fit
     from diffdisp.glasses import load_glass
-    from diffdisp.image import read_picture
+    from diffdisp.image import read_mask, read_picture
     from diffdisp.report import result_table, write_fit_json, write_report
     from diffdisp.scene_file import load_scene
 
     scene, target = load_scene(options.scene), read_picture(options.target)
     start = None if options.start is None else load_glass(options.start)
+    mask = None if options.mask is None else read_mask(options.mask)
     _keep_compiled()
     with _progress_bar("fitting", "step") as bar:
 
@@ -400,6 +404,7 @@ def _fit(options: argparse.Namespace) -> int:
             prior=options.prior,
             noise=options.noise,
             start=start,
+            mask=mask,
             progress=progress,
         )
     folder.mkdir(parents=True, exist_ok=True)

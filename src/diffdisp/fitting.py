@@ -181,6 +181,7 @@ class FitResult:
         samples: film samples per pixel of the last level: of most pixels, of the hardest.
         picture: (height, width, channels) render with the fitted glass, exposed as the target.
         free: what else was free.
+        used: (height, width) pixels that the fit went by; None where it was all of them.
     """
 
     scene: Scene
@@ -213,6 +214,12 @@ class FitResult:
     samples: tuple[int, ...]
     picture: np.ndarray
     free: tuple[FreeValue, ...] = ()
+    used: np.ndarray | None = None
+
+    @property
+    def masked(self) -> int:
+        """How many pixels a mask left out."""
+        return 0 if self.used is None else int(np.sum(~self.used))
 
 
 class Coefficients(eqx.Module):
@@ -356,7 +363,8 @@ class Problem(NamedTuple):
         number: number of the ball among the objects.
         ball: its number among those of glass.
         film: the target's.
-        target: (height, width, channels).
+        target: (height, width, channels); 0 where it is not used.
+        used: (height, width) pixels that count.
         unknowns: what is looked for.
         free: what else is.
         progress: called with the step, the root mean square residual and n_d.
@@ -367,6 +375,7 @@ class Problem(NamedTuple):
     ball: int
     film: Film
     target: np.ndarray
+    used: np.ndarray
     unknowns: Unknowns
     free: Free
     progress: Callable[[int, float, float], None]
@@ -401,12 +410,14 @@ class Level(NamedTuple):
     """One resolution of the problem.
 
     Args:
-        parts: what renders it; the shares of each block's parts sum to 1.
+        blocks: (blocks,) numbers of those that count, row by row over the film.
+        parts: what renders them; the shares of each block's parts sum to 1.
         target: (blocks, channels).
         weights: (blocks, 1) of the squared residuals.
         seed: of the render.
     """
 
+    blocks: np.ndarray
     parts: tuple[Part, ...]
     target: np.ndarray
     weights: np.ndarray
@@ -422,6 +433,7 @@ def fit(
     prior: str = "none",
     noise: float | None = None,
     start: Sellmeier | None = None,
+    mask: np.ndarray | None = None,
     progress: Callable[[int, float, float], None] | None = None,
 ) -> FitResult:
     """The Sellmeier coefficients of a glass ball from a picture of it, in float64.
@@ -441,6 +453,8 @@ def fit(
         noise: standard deviation of the target's values where it is known; otherwise errors are
             estimated from the residual, heteroscedasticity-consistent.
         start: a glass to start from instead of the scene's.
+        mask: (height, width) of the target; pixels where it is zero or False are left out of the
+            fit and of its errors. They may hold anything, NaN too.
         progress: called with the step, the root mean square residual and n_d.
 
     Returns:
@@ -449,7 +463,8 @@ def fit(
     Raises:
         ValueError: no such glass ball, or several and no name; a start with a pole in the band or
             without any free coefficient; an unknown prior; a noise that is not positive; a name
-            in `free` that the scene does not have.
+            in `free` that the scene does not have; a mask of another size, or that leaves
+            nothing; values that are used and not finite.
     """
     if prior not in PRIORS:
         raise ValueError(f"prior {prior!r}: allowed are {', '.join(PRIORS)}")
@@ -458,11 +473,28 @@ def fit(
     number = _glass_object(scene, object_name)
     if start is not None:
         scene = with_glass(scene, number, start)
-    film = target.film
-    check_glasses(scene, *film_range(film))
+    check_glasses(scene, *film_range(target.film))
+    used = _used(target, mask)
+    target = replace(target, radiance=np.where(used[..., None], target.radiance, 0.0))
     with jax.enable_x64(True):
-        problem = _problem(scene, number, target, free, prior, progress or _silent)
+        problem = _problem(scene, number, target, used, free, prior, progress or _silent)
         return _fit(problem, target, prior, noise)
+
+
+def _used(target: Picture, mask: np.ndarray | None) -> np.ndarray:
+    """Pixels (height, width) of a target that a mask does not leave out."""
+    size = target.radiance.shape[:2]
+    used = np.ones(size, bool) if mask is None else np.asarray(mask) != 0
+    if used.shape != size:
+        raise ValueError(f"mask {used.shape}: must be {size}, (height, width) of the target")
+    if not used.any():
+        raise ValueError("mask: zero everywhere leaves nothing to fit")
+    broken = np.count_nonzero(~np.isfinite(target.radiance[used]))
+    if broken:
+        raise ValueError(
+            f"target: {broken} of its values are not finite; a mask may leave them out"
+        )
+    return used
 
 
 def _silent(step: int, rms: float, n_d: float) -> None:
@@ -486,6 +518,7 @@ def _problem(
     scene: Scene,
     number: int,
     target: Picture,
+    used: np.ndarray,
     free: Sequence[str],
     prior: str,
     progress: Callable[[int, float, float], None],
@@ -512,7 +545,7 @@ def _problem(
     ball = [i for i, obj in enumerate(scene.objects) if is_glass(obj)].index(number)
     unknowns = Unknowns(coefficients, reference, project, mean, rows)
     others = _free(scene, number, target, free)
-    return Problem(scene, number, ball, film, target.radiance, unknowns, others, progress)
+    return Problem(scene, number, ball, film, target.radiance, used, unknowns, others, progress)
 
 
 def _free(scene: Scene, number: int, target: Picture, names: Sequence[str]) -> Free:
@@ -564,14 +597,34 @@ def _level(
 ) -> Level:
     """The problem in blocks of `size` pixels, each with `samples` · `split`² samples.
 
-    What fills no block at the border is left out.
+    What fills no block at the border is left out; where that is all, the blocks are pixels.
     """
-    film, target = problem.film, problem.target
+    film = problem.film
     width, height = film.width // size, film.height // size
-    cut = target[: height * size, : width * size]
-    means = cut.reshape(height, size, width, size, -1).mean((1, 3)).reshape(height * width, -1)
-    part = _part(problem, size, samples, depth, np.arange(height * width), split)
-    return Level((part,), means, np.ones((len(means), 1)), seed)
+
+    def means(values: np.ndarray) -> np.ndarray:
+        cut = values[: height * size, : width * size]
+        return cut.reshape(height, size, width, size, -1).mean((1, 3)).reshape(height * width, -1)
+
+    share = means(problem.used)
+    blocks = np.flatnonzero(_counted(share[:, 0]))
+    if not len(blocks):
+        return _level(problem, 1, samples, depth, seed, split)
+    share = share[blocks]
+    part = _part(problem, size, samples, depth, blocks, np.arange(len(blocks)), split)
+    return Level(blocks, (part,), means(problem.target)[blocks] / share, share, seed)
+
+
+def _counted(share: np.ndarray) -> np.ndarray:
+    """Which blocks count, by the part (blocks,) of each one's pixels that are used.
+
+    The mean of some pixels of a block is not quite what a render of the whole block shows. So
+    blocks that are cut count only where the whole ones hold less than half of the used pixels, as
+    in a large picture with dead pixels all over: with the mean of their used pixels, weighed by
+    their part. At single pixels every block is whole or does not count.
+    """
+    whole = share == 1
+    return whole if 2 * np.sum(share[whole]) >= np.sum(share) else share > 0
 
 
 def _part(
@@ -579,16 +632,17 @@ def _part(
     size: int,
     samples: int,
     depth: int,
+    blocks: np.ndarray,
     rows: np.ndarray,
     split: int = 1,
     share: float = 1.0,
 ) -> Part:
-    """The blocks of `size` pixels with numbers `rows`, at `samples` · `split`² samples."""
+    """The blocks of `size` pixels with numbers `blocks`, at `samples` · `split`² samples."""
     film = problem.film
     plan = replace(make_plan(problem.scene, film, samples, depth, "float64"), dispersive=True)
     spectrum = film_spectrum(film, plan)
     width = film.width // size
-    y, x = np.divmod(rows[:, None], width)
+    y, x = np.divmod(blocks[:, None], width)
     down, right = np.divmod(np.arange(split**2), split)
     numbers = (y * split + down) * (width * split) + x * split + right
     count = chunk_pixels(film, plan)
@@ -927,7 +981,16 @@ def _refined(problem: Problem, few: Descent, level: Level, depth: int) -> tuple[
     hard = np.zeros(len(change), bool)
     hard[np.argsort(-change)[: int(np.sum(some.weight.any(axis=1)) * REFINED)]] = True
     parts = tuple(
-        _part(problem, 1, FEW_SAMPLES, depth, np.flatnonzero(which), split, share)
+        _part(
+            problem,
+            1,
+            FEW_SAMPLES,
+            depth,
+            level.blocks[which],
+            np.flatnonzero(which),
+            split,
+            share,
+        )
         for which, split, share in (
             (~hard, SPLITS[0], 1.0),
             (hard, SPLITS[0], -1 / 3),
@@ -945,11 +1008,11 @@ def _refined(problem: Problem, few: Descent, level: Level, depth: int) -> tuple[
     sigma = max(1.4826 * median, CLEAN * problem.free.brightest)
     weights = 1 / (1 + (error / sigma) ** 2)
     if problem.free.parameters:
-        weights *= _resolved(problem, few.lin.columns, some.columns)
+        weights *= _resolved(problem, level.blocks, few.lin.columns, some.columns)
     return level._replace(parts=parts, weights=weights), at
 
 
-def _resolved(problem: Problem, few: Columns, many: Columns) -> np.ndarray:
+def _resolved(problem: Problem, blocks: np.ndarray, few: Columns, many: Columns) -> np.ndarray:
     """Weights (blocks, 1): 0 for pixels whose slopes along the scene's numbers need more samples.
 
     Where a silhouette runs through a pixel its slopes are those of few samples next to the edge:
@@ -964,12 +1027,12 @@ def _resolved(problem: Problem, few: Columns, many: Columns) -> np.ndarray:
         for slopes in (many.values, many.values - few.values)
     )
     typical = np.sqrt(np.mean(values**2))
-    wide = np.pad(
-        (changes > UNRESOLVED * np.maximum(values, typical)).reshape(film.height, film.width), 1
-    )
+    some = np.zeros(film.height * film.width, bool)
+    some[blocks] = changes > UNRESOLVED * np.maximum(values, typical)
+    wide = np.pad(some.reshape(film.height, film.width), 1)
     rows = wide[:-2] | wide[1:-1] | wide[2:]
     unsure = rows[:, :-2] | rows[:, 1:-1] | rows[:, 2:]
-    return np.where(unsure, 0.0, 1.0).reshape(-1, 1)
+    return np.where(unsure, 0.0, 1.0).reshape(-1, 1)[blocks]
 
 
 def _starts(problem: Problem, level: Level, most: int) -> list[Point]:
@@ -993,10 +1056,10 @@ def _starts(problem: Problem, level: Level, most: int) -> list[Point]:
         part = (place - left)[:, None, None]
         seen = table[left] * (1 - part) + table[left + 1] * part
         picture = np.einsum("jpc,jcd->pd", seen, weights, optimize=True)
-        others = _exposed(problem.free, picture, target, columns)
+        others = _exposed(problem.free, picture, target, columns, level.weights)
         gains, black = problem.free.exposure(others)
         some = gains[columns] if problem.free.gains else gains
-        cost = float(np.sum((some * picture + black - target) ** 2))
+        cost = float(np.sum(level.weights * (some * picture + black - target) ** 2))
         found.append((cost, float(np.mean(index)), Point(z, others)))
     found.sort(key=lambda entry: entry[0])
     chosen: list[tuple[float, float, Point]] = []
@@ -1009,7 +1072,11 @@ def _starts(problem: Problem, level: Level, most: int) -> list[Point]:
 
 
 def _exposed(
-    free: Free, picture: np.ndarray, target: np.ndarray, columns: np.ndarray
+    free: Free,
+    picture: np.ndarray,
+    target: np.ndarray,
+    columns: np.ndarray,
+    weights: np.ndarray,
 ) -> np.ndarray:
     """Coordinates of the others: the scene's as they are, and the exposure that fits best.
 
@@ -1018,14 +1085,17 @@ def _exposed(
         picture: (blocks, d) some channels of a render.
         target: (blocks, d) of the target.
         columns: (d,) their numbers; between them gains are interpolated.
+        weights: (blocks, 1) of their squared residuals.
     """
     others = np.zeros(free.total)
-    squares, sums = np.sum(picture**2, axis=0) + 1e-300, np.sum(picture, axis=0)
-    products, missing = np.sum(picture * target, axis=0), np.sum(target - picture)
-    black = missing / picture.size
+    weights = np.broadcast_to(weights, picture.shape)
+    squares, sums = (np.sum(weights * picture**power, axis=0) for power in (2, 1))
+    squares = squares + 1e-300
+    products, seen = np.sum(weights * picture * target, axis=0), np.sum(weights * target)
+    black = (seen - np.sum(sums)) / np.sum(weights)
     if free.gains:
-        rest = picture.size - np.sum(sums**2 / squares)
-        black = (np.sum(target) - np.sum(sums * products / squares)) / max(rest, 1e-300)
+        rest = np.sum(weights) - np.sum(sums**2 / squares)
+        black = (seen - np.sum(sums * products / squares)) / max(rest, 1e-300)
         black *= free.blacks
         gains = np.log(np.clip((products - black * sums) / squares, 1e-3, 1e3))
         start = len(free.parameters)
@@ -1044,7 +1114,7 @@ def _index_table(problem: Problem, level: Level) -> np.ndarray:
     spectrum = Spectrum(np.full(len(INDEX_GRID), middle), None, None)
     size, run = film_size(problem.film), run_numbers(plan, level.seed, 1e-3)
     edge = int(part.chunks.size)
-    chunks, place = some_blocks(part.rows, problem.film.width // edge, float(edge), 4)
+    chunks, place = some_blocks(level.blocks, problem.film.width // edge, float(edge), 4)
 
     def trace(chunks: Pixels) -> np.ndarray:
         return np.asarray(
@@ -1209,9 +1279,24 @@ def _result(
         prior=prior,
         noise=given,
         samples=tuple(part.plan.samples * part.split**2 for part in level.parts),
-        picture=lin.picture.reshape(problem.target.shape),
+        picture=_whole_picture(problem, level, end),
         free=tuple(_free_values(free, scene, end.at.others, np.sqrt(np.diag(whole)))),
+        used=None if problem.used.all() else problem.used,
     )
+
+
+def _whole_picture(problem: Problem, level: Level, end: Descent) -> np.ndarray:
+    """The render (height, width, channels) where a fit ended, of what a mask left out too."""
+    pixels = np.zeros((problem.used.size, problem.film.channels))
+    pixels[level.blocks] = end.lin.picture
+    rest = np.flatnonzero(~problem.used)
+    if len(rest):
+        like, (gains, black) = level.parts[0], problem.free.exposure(end.at.others)
+        own = np.arange(len(rest))
+        part = _part(problem, 1, like.plan.samples, like.plan.depth, rest, own, like.split)
+        traced = _trace(problem, part, end.at, level.seed, CUTOFF, False)
+        pixels[rest] = traced[:, 0] * gains + black
+    return pixels.reshape(problem.target.shape)
 
 
 def _with_others(problem: Problem, others: np.ndarray) -> Scene:

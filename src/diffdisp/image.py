@@ -14,7 +14,7 @@ from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from diffdisp.color import bands_to_rgb, check_visible, decode_srgb, encode_srgb
 from diffdisp.film import Film
@@ -203,11 +203,7 @@ def read_picture(path: str | Path) -> Picture:
             disagree; the message names the file and what was found.
         ImportError: a package that the format takes is not installed.
     """
-    suffix = _suffix(path)
-    _extra_module(SUFFIX_MODULES[suffix], path)
-    if not Path(path).is_file():
-        raise ValueError(f"{path}: there is no such file")
-    try:
+    with _readable(path) as suffix:
         match suffix:
             case ".npz":
                 fields = _read_npz(Path(path))
@@ -218,12 +214,54 @@ def read_picture(path: str | Path) -> Picture:
             case _:
                 fields = _read_tiff(Path(path))
         return _picture(fields)
+
+
+@contextlib.contextmanager
+def _readable(path: str | Path) -> Iterator[str]:
+    """The suffix of a picture; what goes wrong while it is read is told of the file."""
+    suffix = _suffix(path)
+    _extra_module(SUFFIX_MODULES[suffix], path)
+    if not Path(path).is_file():
+        raise ValueError(f"{path}: there is no such file")
+    try:
+        yield suffix
     except ImportError:
         raise
     # Each decoder has its own kinds of error for a damaged file, some of them undocumented.
     except Exception as error:
         reason = str(error) or type(error).__name__
         raise ValueError(f"{path}: cannot be read as a {suffix} picture: {reason}") from error
+
+
+def read_mask(path: str | Path) -> Bool[np.ndarray, "height width"]:
+    """Read which pixels a picture marks: those with a channel that is not zero.
+
+    Args:
+        path: .npz with `mask` (height, width), or any picture that `read_picture` reads; a .tiff of
+            whole numbers too.
+
+    Raises:
+        ValueError: as `read_picture`.
+        ImportError: as `read_picture`.
+    """
+    with _readable(path) as suffix:
+        match suffix:
+            case ".npz":
+                fields = _read_npz(Path(path), "mask")
+            case ".png":
+                fields = _read_png(Path(path))
+            case ".exr":
+                fields = _read_exr(Path(path))
+            case _:
+                fields = _tiff_fields(Path(path))
+        values = np.asarray(fields.get("mask", fields.get("radiance")))
+        if values.dtype.kind not in "fiub" or not np.isfinite(values).all():
+            raise ValueError(f"a mask must be finite numbers; found {values.dtype}")
+        marked = values != 0
+        marked = np.any(marked, axis=-1) if marked.ndim == 3 else marked
+        if marked.ndim != 2 or 0 in marked.shape:
+            raise ValueError(f"a mask must be (height, width); found {values.shape}")
+        return marked
 
 
 def _picture(fields: Mapping[str, Any]) -> Picture:
@@ -283,15 +321,16 @@ def _described(description: Any) -> dict[str, Any]:
     return {key: found[key] for key in keys if key in found}
 
 
-def _read_npz(path: Path) -> dict[str, Any]:
+def _read_npz(path: Path, instead: str = "radiance") -> dict[str, Any]:
+    """The keys that are known, and `instead` of a radiance."""
     if not zipfile.is_zipfile(path):
         raise ValueError("it is no .npz archive")
     with np.load(path, allow_pickle=False) as archive:
-        known = ("radiance", "wavelength", *COUNTS)
+        known = ("radiance", "wavelength", *COUNTS, instead)
         # Only the known keys are read: the others may hold anything, also what cannot be read.
         found = {name: archive[name] for name in known if name in archive.files}
-        if "radiance" not in found:
-            raise ValueError(f"it has no radiance; found {sorted(archive.files) or 'nothing'}")
+        if not {"radiance", instead} & set(found):
+            raise ValueError(f"it has no {instead}; found {sorted(archive.files) or 'nothing'}")
         return found
 
 
@@ -353,6 +392,15 @@ def _write_tiff(path: Path, picture: Picture) -> None:
 
 
 def _read_tiff(path: Path) -> dict[str, Any]:
+    fields = _tiff_fields(path)
+    if fields["radiance"].dtype.kind != "f":
+        # Whether whole numbers are linear or encoded is a guess; in a PNG it is not.
+        raise ValueError(f"its values must be floating-point; found {fields['radiance'].dtype}")
+    return fields
+
+
+def _tiff_fields(path: Path) -> dict[str, Any]:
+    """The keys of a .tiff file, its values as they are."""
     with _extra_module("tifffile", path).TiffFile(path) as file:
         if len(file.pages) != 1:
             raise ValueError(f"it has {len(file.pages)} pages, not one")
@@ -360,9 +408,6 @@ def _read_tiff(path: Path) -> dict[str, Any]:
         values, fields = page.asarray(), _described(page.description)
         if page.axes.startswith("S"):
             values = np.moveaxis(values, 0, -1)
-    if values.dtype.kind != "f":
-        # Whether whole numbers are linear or encoded is a guess; in a PNG it is not.
-        raise ValueError(f"its values must be floating-point; found {values.dtype}")
     if values.ndim == 2 and "wavelength" in fields:
         values = values[..., None]
     return {**fields, "radiance": values}

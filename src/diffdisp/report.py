@@ -68,6 +68,7 @@ def fit_json(result: FitResult) -> dict[str, Any]:
         "determined": int(result.determined),
         "summary": result.summary,
         "rms_residual": _plain(result.rms_residual),
+        "left_out": {"masked_pixels": result.masked},
         "nearest_glasses": [
             {"name": name, "distance": _plain(distance)}
             for name, distance in result.nearest_glasses
@@ -109,7 +110,7 @@ def result_table(result: FitResult) -> str:
     """
     rows = [
         ("object", result.object_name or "(unnamed)"),
-        ("converged", f"{'yes' if result.converged else 'NO'}, {_steps(result.steps)}"),
+        ("converged", f"{'yes' if result.converged else 'NO'}, {_count(result.steps, 'step')}"),
         *([] if result.converged else [("message", result.message)]),
         ("prior", result.prior),
         ("n_d", _with_error(result.n_d, result.n_d_std)),
@@ -120,14 +121,15 @@ def result_table(result: FitResult) -> str:
         ("determined", f"{result.determined} of {len(result.singular_values)} directions"),
         ("nearest", _nearest(result)),
         ("residual", f"{result.rms_residual:.3g} rms"),
+        *([("left out", f"{_count(result.masked, 'pixel')} by the mask")] if result.masked else []),
     ]
     width = max([11, *(len(value.name) + 2 for value in result.free)])
     table = "\n".join(f"{name:<{width}}{text}" for name, text in rows)
     return f"{table}\n\n{textwrap.fill(result.summary, 79)}"
 
 
-def _steps(count: int) -> str:
-    return f"{count} step" if count == 1 else f"{count} steps"
+def _count(number: int, thing: str) -> str:
+    return f"{number} {thing}{'' if number == 1 else 's'}"
 
 
 def _coefficient_rows(result: FitResult) -> Iterator[tuple[str, str]]:
@@ -212,11 +214,15 @@ def _draw_pictures(axes: list[Axes], result: FitResult, target: Picture) -> None
         axis.imshow(picture, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
         axis.set_title(f"{title} ({seen_as})")
     residual = np.mean(np.asarray(result.picture, np.float64) - target.radiance, axis=-1)
-    limit = float(np.percentile(np.abs(residual), 99.5)) or float(np.abs(residual).max()) or 1.0
+    told = residual if result.used is None else residual[result.used]
+    limit = float(np.percentile(np.abs(told), 99.5)) or float(np.abs(told).max()) or 1.0
+    if result.used is not None:
+        residual = np.where(result.used, residual, np.nan)
+        axes[2].set_facecolor("0.6")
     drawn = axes[2].imshow(
         residual, cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest"
     )
-    axes[2].set_title("residual (fit − target)")
+    axes[2].set_title(f"residual (fit − target){'' if result.used is None else ', grey: masked'}")
     bar = axes[2].figure.colorbar(drawn, ax=axes[2], extend="both", shrink=0.9)
     bar.set_label(f"radiance, mean over {_channels(target)}")
     bar.formatter.set_powerlimits((-2, 3))  # type: ignore[attr-defined]
@@ -245,7 +251,7 @@ def _displayed(
         light, exposed_for = radiance[..., middle], target.radiance[..., middle]
         seen_as = f"{target.wavelengths[middle] * 1e3:.4g} nm"
     # A few glints may saturate; the picture behind them should not be dark.
-    white = float(np.percentile(exposed_for, 99))
+    white = float(np.nanpercentile(exposed_for, 99))
     return encode_srgb(np.asarray(light, np.float64) / (white if white > 0 else 1.0)), seen_as
 
 
