@@ -22,7 +22,7 @@ from diffdisp.fitting import (
     fit,
 )
 from diffdisp.glasses import glass_table, named_glass
-from diffdisp.image import Picture, read_picture
+from diffdisp.image import Picture, read_picture, write_picture
 from diffdisp.linearised import Columns, linearise
 from diffdisp.rendering import render
 from diffdisp.scene import Scene
@@ -359,6 +359,49 @@ def test_noise_alone_is_no_fit(visible):
     result = fit(bench(SILICA), Picture(radiance, visible.wavelengths, SAMPLES, DEPTH, 0))
     assert not result.converged
     assert result.message
+
+
+# --- clipped values
+
+
+def test_an_overexposed_picture(tmp_path):
+    clean = own_target(bench(BK7), Film(24, 24))
+    exposed = with_noise(replace(clean, radiance=1.5 * clean.radiance), 1)
+    write_picture(tmp_path / "a.png", exposed)
+    target = replace(read_picture(tmp_path / "a.png"), samples=SAMPLES, depth=DEPTH, seed=0)
+    result = fit(bench(SILICA), target, free=("gain",))
+    assert result.converged, result.message
+    assert result.clipped == np.sum(exposed.radiance >= target.ceiling) > 500
+    assert f" {result.clipped} values of the target are clipped" in result.summary
+    assert abs(result.n_d - float(BK7.n_d)) < 3 * result.n_d_std < 6e-4
+    assert abs(result.V_d - float(BK7.V_d)) < 3 * result.V_d_std
+    for _, gain, std in result.free:  # 32 reported errors off where clipped values are believed
+        assert abs(gain - 1.5) < 4 * std < 0.01
+
+
+def test_what_is_just_as_bright_as_white_is_not_clipped_away(tmp_path, color):
+    # Bright tiles shine with radiance 1, the top code; a few pixels see nothing else.
+    write_picture(tmp_path / "a.png", color)
+    target = replace(read_picture(tmp_path / "a.png"), samples=SAMPLES, depth=DEPTH, seed=0)
+    result = fit(bench(SILICA), target, free=("gain",))
+    assert result.converged, result.message
+    assert result.clipped > 10
+    # Rounding to 8 bits is no independent noise, yet leaves errors of the reported size.
+    assert abs(result.n_d - float(BK7.n_d)) < 3 * result.n_d_std < 3e-4
+    for _, gain, _ in result.free:
+        assert abs(gain - 1) < 2e-3  # half a code at the top is 4.5e-3
+
+
+@pytest.mark.slow
+def test_a_png_of_another_renderer():
+    result = fit(load_scene(TARGETS / "ball_nbk7.toml"), read_picture(TARGETS / "ball_nbk7.png"))
+    truth = named_glass("N-BK7")
+    assert result.converged, result.message
+    assert result.clipped == 3023 + 3022 + 3024  # the tiles beside the ball
+    # What 8 bits of three channels leave open; and the errors are admitted.
+    assert abs(result.n_d - float(truth.n_d)) <= min(2e-4, 3 * result.n_d_std)
+    assert abs(result.V_d - float(truth.V_d)) <= min(1.0, 3 * result.V_d_std)
+    assert result.nearest_glasses[0][0] == "N-BK7"
 
 
 # --- a mask

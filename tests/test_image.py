@@ -1,6 +1,7 @@
 import json
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -495,3 +496,27 @@ def test_what_is_no_mask(tmp_path, fields, words):
     np.savez(tmp_path / "m.npz", **fields)
     with pytest.raises(ValueError, match=words):
         read_mask(tmp_path / "m.npz")
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_a_png_tells_where_it_was_cut_off(tmp_path, bits):
+    top = 2**bits - 1
+    # What is just above is rounded to the top code, what is just below to the one beneath.
+    edges = decode_srgb((top - np.array([0.49, 0.51, 0.0])) / top)
+    write_picture(tmp_path / "a.png", Picture(edges[None, None]), bits=bits)
+    read = read_picture(tmp_path / "a.png")
+    np.testing.assert_array_equal(read.radiance[0, 0] >= read.ceiling, [True, False, True])
+    np.testing.assert_allclose(read.ceiling, (edges[0] + edges[1]) / 2, rtol=1e-6)
+
+
+def test_other_formats_have_no_ceiling(tmp_path):
+    for suffix in EXACT:
+        path = tmp_path / f"a{suffix}"
+        write_picture(path, replace(picture(3), ceiling=0.5))
+        assert read_picture(path).ceiling is None
+
+
+@pytest.mark.parametrize("ceiling", [0.0, -1.0, np.nan, np.inf])
+def test_a_ceiling_that_is_none(ceiling):
+    with pytest.raises(ValueError, match="ceiling must be positive and finite"):
+        replace(picture(3), ceiling=ceiling)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from diffdisp.linearised import Columns, linearise
+from diffdisp.misfit import Clipped, misfit
 
 CHANNELS, BLOCKS, WIDEST = 3, 40, 3.0
 OTHERS, TOTAL = 6, 9
@@ -118,3 +119,35 @@ def test_what_weighs_nothing_does_not_count():
     assert abs(lin.noise / alone.noise - 1) < 1e-13
     np.testing.assert_allclose(np.abs(lin.q), np.abs(alone.q), rtol=1e-10, atol=1e-12)
     np.testing.assert_allclose(lin.rms, np.sqrt(np.mean((example.picture - example.target) ** 2)))
+
+
+def test_clipped_values_pull_by_their_likelihood():
+    example = Example(5)
+    where = np.random.default_rng(6).random((BLOCKS, CHANNELS)) < 0.3
+    clipped = Clipped(where, example.target, 0.5)
+    lin = linearise(
+        example.picture, example.target, example.columns, example.weights, WIDEST, clipped
+    )
+    told = misfit(example.picture, example.target, clipped)
+    jacobian = dense(example.columns)
+    weights = np.broadcast_to(example.weights, where.shape).ravel()
+    score = weights * told.score.ravel()
+    information = (jacobian * (weights * told.curvature.ravel())[:, None]).T @ jacobian
+    near = np.diag([(lin.noise / WIDEST) ** 2] * OTHERS + [0.0] * (TOTAL - OTHERS))
+    # Sums of 120 products: rounding.
+    np.testing.assert_allclose(lin.r.T @ lin.r, information + near, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(lin.r.T @ lin.q, jacobian.T @ score, rtol=1e-10, atol=1e-12)
+    spread = (jacobian * (score**2)[:, None]).T @ jacobian
+    meat = lin.r.T @ (lin.meat - lin.held) @ lin.r
+    np.testing.assert_allclose(meat, spread, rtol=1e-9, atol=1e-11)
+    # At a noise of 1 the spread of the score is the information, but for what weighs less.
+    white = (jacobian * (weights**2 * told.curvature.ravel())[:, None]).T @ jacobian
+    np.testing.assert_allclose(lin.r.T @ lin.white @ lin.r, white, rtol=1e-9, atol=1e-11)
+
+
+def test_no_value_is_clipped_where_none_is_marked(example):
+    nowhere = Clipped(np.zeros((BLOCKS, CHANNELS), bool), example.target, 0.1)
+    fixed = example.picture, example.target, example.columns, example.weights, WIDEST
+    for had, has in zip(example.lin, linearise(*fixed, nowhere), strict=True):
+        if not isinstance(had, Columns):
+            np.testing.assert_allclose(has, had, rtol=1e-12)

@@ -45,6 +45,7 @@ from diffdisp.glasses import glass_table
 from diffdisp.image import Picture
 from diffdisp.integrator import Lanes, followed_radiance, lane_radiance
 from diffdisp.linearised import Columns, Eliminated, Linearised, linearise
+from diffdisp.misfit import Clipped
 from diffdisp.parameters import Parameter, Place, named_parameters, value_at, with_coordinates
 from diffdisp.planning import Plan, make_plan
 from diffdisp.programs import OPTIONS
@@ -182,6 +183,7 @@ class FitResult:
         picture: (height, width, channels) render with the fitted glass, exposed as the target.
         free: what else was free.
         used: (height, width) pixels that the fit went by; None where it was all of them.
+        clipped: how many of their values were cut off and count as "at least that bright".
     """
 
     scene: Scene
@@ -215,6 +217,7 @@ class FitResult:
     picture: np.ndarray
     free: tuple[FreeValue, ...] = ()
     used: np.ndarray | None = None
+    clipped: int = 0
 
     @property
     def masked(self) -> int:
@@ -365,6 +368,7 @@ class Problem(NamedTuple):
         film: the target's.
         target: (height, width, channels); 0 where it is not used.
         used: (height, width) pixels that count.
+        ceiling: from which on values are clipped; infinity where none are.
         unknowns: what is looked for.
         free: what else is.
         progress: called with the step, the root mean square residual and n_d.
@@ -376,6 +380,7 @@ class Problem(NamedTuple):
     film: Film
     target: np.ndarray
     used: np.ndarray
+    ceiling: float
     unknowns: Unknowns
     free: Free
     progress: Callable[[int, float, float], None]
@@ -415,6 +420,7 @@ class Level(NamedTuple):
         target: (blocks, channels).
         weights: (blocks, 1) of the squared residuals.
         seed: of the render.
+        clipped: values of the target that were cut off; None where there are none.
     """
 
     blocks: np.ndarray
@@ -422,6 +428,7 @@ class Level(NamedTuple):
     target: np.ndarray
     weights: np.ndarray
     seed: int
+    clipped: Clipped | None
 
 
 def fit(
@@ -441,7 +448,8 @@ def fit(
     Args:
         scene: what the picture shows; the ball's glass in it is where the fit starts.
         target: the picture; its film is the fit's. Its `samples`, `depth` and `seed` are used in
-            the last level where it has them.
+            the last level where it has them. Values that reach its `ceiling` were cut off: they
+            count as "at least that bright".
         object_name: the ball, where the scene has several of glass.
         free: what is not known well beside the glass and is fitted too, from its value in the
             scene: numbers of the scene by name, such as "ball.center", "ball.center.z",
@@ -545,7 +553,9 @@ def _problem(
     ball = [i for i, obj in enumerate(scene.objects) if is_glass(obj)].index(number)
     unknowns = Unknowns(coefficients, reference, project, mean, rows)
     others = _free(scene, number, target, free)
-    return Problem(scene, number, ball, film, target.radiance, used, unknowns, others, progress)
+    ceiling = np.inf if target.ceiling is None else target.ceiling
+    picture = target.radiance
+    return Problem(scene, number, ball, film, picture, used, ceiling, unknowns, others, progress)
 
 
 def _free(scene: Scene, number: int, target: Picture, names: Sequence[str]) -> Free:
@@ -612,7 +622,22 @@ def _level(
         return _level(problem, 1, samples, depth, seed, split)
     share = share[blocks]
     part = _part(problem, size, samples, depth, blocks, np.arange(len(blocks)), split)
-    return Level(blocks, (part,), means(problem.target)[blocks] / share, share, seed)
+    target = means(problem.target)[blocks] / share
+    return Level(blocks, (part,), target, share, seed, _clipped(problem, means, blocks, share))
+
+
+def _clipped(
+    problem: Problem,
+    means: Callable[[np.ndarray], np.ndarray],
+    blocks: np.ndarray,
+    share: np.ndarray,
+) -> Clipped | None:
+    """The values of some blocks that were cut off; a block with one such is at least its mean."""
+    over = problem.target >= problem.ceiling
+    if not over.any():
+        return None
+    least = means(np.minimum(problem.target, problem.ceiling))[blocks] / share
+    return Clipped(means(over)[blocks] > 0, least, CLEAN * problem.free.brightest)
 
 
 def _counted(share: np.ndarray) -> np.ndarray:
@@ -775,7 +800,27 @@ def _linearise(
         free.total,
         free.total + len(problem.unknowns.project),
     )
-    return linearise(radiance[:, 0] + black, level.target, columns, level.weights, WIDEST)
+    return _reduced(level, radiance[:, 0] + black, columns)
+
+
+def _reduced(level: Level, picture: np.ndarray, columns: Columns) -> Linearised:
+    """A level's picture and its slopes, reduced to what a step needs."""
+    return linearise(picture, level.target, columns, level.weights, WIDEST, level.clipped)
+
+
+def _rescaled(level: Level, lin: Linearised, brightest: float) -> tuple[Level, Linearised]:
+    """A level with the noise that its picture shows, where clipped values have to know it.
+
+    1.4826 median deviations of normal noise are its standard deviation. The median is that of
+    flat parts of a picture, where most clipped values are.
+    """
+    if level.clipped is None:
+        return level, lin
+    ordinary = np.abs(lin.score)[~level.clipped.where]
+    median = float(np.median(ordinary)) if ordinary.size else 0.0
+    noise = max(1.4826 * median, CLEAN * brightest)
+    level = level._replace(clipped=level.clipped._replace(noise=noise))
+    return level, _reduced(level, lin.picture, lin.columns)
 
 
 class Step(NamedTuple):
@@ -916,7 +961,9 @@ def _descend(
 
     unknowns = problem.unknowns
     least = LEAST_CHANGE[0] if problem.film.wavelengths is not None else LEAST_CHANGE[1]
-    lin, damping, converged = look(at), 0.0, False
+    brightest = problem.free.brightest
+    level, lin = _rescaled(level, look(at), brightest)
+    damping, converged = 0.0, False
     steps, anchor = 1, at.z
     while steps < most and not converged:
         problem.progress(steps, lin.rms, _n_d(unknowns, at.z))
@@ -925,7 +972,11 @@ def _descend(
         largest, visible = _largest(unknowns, at, new), np.linalg.norm(lin.r @ change)
         if largest < least or visible < small * lin.noise:
             # So near the picture is linear: it need not be traced again.
-            at, lin, converged = new, lin.moved(change), True
+            if level.clipped is None:
+                lin = lin.moved(change)
+            else:
+                lin = _reduced(level, lin.picture + lin.columns.along(change), lin.columns)
+            at, converged = new, True
             break
         if damping:
             new, change = _next_point(unknowns, at, anchor, lin, damping)
@@ -942,7 +993,8 @@ def _descend(
         if has > had and largest < 100 * least:
             converged = True  # what is left of the residual is rounding
         elif has <= had or rough:
-            at, lin, damping = new, tried, damping / 10 if damping > 1e-2 else 0.0
+            at, damping = new, damping / 10 if damping > 1e-2 else 0.0
+            level, lin = _rescaled(level, tried, brightest)
         else:
             damping = max(10 * damping, 1.0)
     return Descent(at, lin, steps, converged)
@@ -1002,7 +1054,7 @@ def _refined(problem: Problem, few: Descent, level: Level, depth: int) -> tuple[
     # What a quarter of the samples changes tells the error of these, and so what a residual tells.
     error = np.max(np.abs(some.picture - few.lin.picture), axis=1, keepdims=True) / 3
     error[hard] /= SPLITS[1] ** 2 / SPLITS[0] ** 2
-    residual = np.abs(some.picture - level.target)[some.weight > 0]
+    residual = np.abs(some.score)[some.weight > 0]
     # 1.4826 median deviations of normal noise are its standard deviation.
     median = float(np.median(residual)) if residual.size else 0.0
     sigma = max(1.4826 * median, CLEAN * problem.free.brightest)
@@ -1046,6 +1098,9 @@ def _starts(problem: Problem, level: Level, most: int) -> list[Point]:
     table = _index_table(problem, level)
     waves, weights, columns = _few_wavelengths(film)
     target = level.target[:, columns]
+    over = np.zeros(target.shape, bool)
+    if level.clipped is not None:
+        over = level.clipped.where[:, columns]
     found: list[tuple[float, float, Point]] = []
     for z in _variants(unknowns, waves):
         index = np.asarray(unknowns.coefficients.index(z, waves))
@@ -1056,10 +1111,12 @@ def _starts(problem: Problem, level: Level, most: int) -> list[Point]:
         part = (place - left)[:, None, None]
         seen = table[left] * (1 - part) + table[left + 1] * part
         picture = np.einsum("jpc,jcd->pd", seen, weights, optimize=True)
-        others = _exposed(problem.free, picture, target, columns, level.weights)
+        others = _exposed(problem.free, picture, target, columns, level.weights * ~over)
         gains, black = problem.free.exposure(others)
         some = gains[columns] if problem.free.gains else gains
-        cost = float(np.sum(level.weights * (some * picture + black - target) ** 2))
+        residual = some * picture + black - target
+        residual[over] = np.minimum(residual[over], 0.0)
+        cost = float(np.sum(level.weights * residual**2))
         found.append((cost, float(np.mean(index)), Point(z, others)))
     found.sort(key=lambda entry: entry[0])
     chosen: list[tuple[float, float, Point]] = []
@@ -1085,19 +1142,19 @@ def _exposed(
         picture: (blocks, d) some channels of a render.
         target: (blocks, d) of the target.
         columns: (d,) their numbers; between them gains are interpolated.
-        weights: (blocks, 1) of their squared residuals.
+        weights: (blocks, d) of their squared residuals.
     """
     others = np.zeros(free.total)
-    weights = np.broadcast_to(weights, picture.shape)
     squares, sums = (np.sum(weights * picture**power, axis=0) for power in (2, 1))
     squares = squares + 1e-300
     products, seen = np.sum(weights * picture * target, axis=0), np.sum(weights * target)
-    black = (seen - np.sum(sums)) / np.sum(weights)
+    black = (seen - np.sum(sums)) / max(np.sum(weights), 1e-300)
     if free.gains:
         rest = np.sum(weights) - np.sum(sums**2 / squares)
         black = (seen - np.sum(sums * products / squares)) / max(rest, 1e-300)
         black *= free.blacks
         gains = np.log(np.clip((products - black * sums) / squares, 1e-3, 1e3))
+        gains = np.where(np.any(weights > 0, axis=0), gains, 0.0)
         start = len(free.parameters)
         others[start : start + free.gains] = np.interp(np.arange(free.gains), columns, gains)
     if free.blacks:
@@ -1249,6 +1306,7 @@ def _result(
     converged, message = _verdict(end)
     left, within = lin.eliminated(), meat[free.total :, free.total :]
     scene = _with_others(problem, end.at.others)
+    clipped = int(np.sum(problem.target >= problem.ceiling))
     return FitResult(
         scene=with_glass(scene, problem.number, glass),
         glass=glass,
@@ -1273,6 +1331,7 @@ def _result(
         singular_values=singular,
         determined=determined,
         summary=_summary(waves, n_std, determined, len(singular), source, prior, own)
+        + _clipped_words(clipped, problem.ceiling)
         + (UNDERSTATED if free.parameters else ""),
         rms_residual=lin.rms,
         nearest_glasses=_nearest(unknowns, end.at.z, left, within),
@@ -1282,6 +1341,7 @@ def _result(
         picture=_whole_picture(problem, level, end),
         free=tuple(_free_values(free, scene, end.at.others, np.sqrt(np.diag(whole)))),
         used=None if problem.used.all() else problem.used,
+        clipped=clipped,
     )
 
 
@@ -1454,3 +1514,11 @@ def _summary(
     if own:
         text += f" The last level used what the picture says of itself: {own}."
     return text
+
+
+def _clipped_words(count: int, ceiling: float) -> str:
+    """How many values were cut off, if any."""
+    if not count:
+        return ""
+    values = "1 value of the target is" if count == 1 else f"{count} values of the target are"
+    return f" {values} clipped: known to be at least {ceiling:.3g}, and no more."

@@ -62,10 +62,12 @@ class Picture:
         samples: samples per pixel, if known.
         depth: most segments of a path, if known.
         seed: seed of the random numbers, if known.
+        ceiling: where values were cut off: one of at least this says no more than that the
+            radiance is at least this. None: nowhere. A .png tells it; no file keeps it.
 
     Raises:
         ValueError: radiance of other than three axes, of no pixels, or whose last axis disagrees
-            with the wavelengths; wavelengths that are not finite and positive.
+            with the wavelengths; wavelengths or a ceiling that are not finite and positive.
     """
 
     # The shapes are checked below, always and in words: they come from files.
@@ -74,12 +76,15 @@ class Picture:
     samples: int | None = None
     depth: int | None = None
     seed: int | None = None
+    ceiling: float | None = None
 
     def __post_init__(self) -> None:
         """Refuse arrays that do not belong together."""
         shape = self.radiance.shape
         if len(shape) != 3 or 0 in shape:
             raise ValueError(f"radiance must be (height, width, channels); found {shape}")
+        if self.ceiling is not None and not (np.isfinite(self.ceiling) and self.ceiling > 0):
+            raise ValueError(f"ceiling must be positive and finite; found {self.ceiling:g}")
         if self.wavelengths is None:
             if shape[2] != 3:
                 raise ValueError(
@@ -190,7 +195,8 @@ def read_picture(path: str | Path) -> Picture:
 
     `.npz` files hold `radiance` (H, W, K or 3), row 0 on top, and `wavelength` (K,) in µm, absent
     for linear sRGB; optionally `samples`, `depth` and `seed`; other keys are ignored. The values
-    of a `.png` are decoded to linear sRGB. Negative radiance is legal: noise has it.
+    of a `.png` are decoded to linear sRGB, and its `ceiling` is told. Negative radiance is legal:
+    noise has it.
 
     Args:
         path: .npz, .png, .tiff, .tif or .exr.
@@ -274,7 +280,7 @@ def _picture(fields: Mapping[str, Any]) -> Picture:
     if "wavelength" in fields:
         wavelengths = _reals(fields, "wavelength").astype(np.float64)
     counts = {name: _whole(fields[name], name) for name in COUNTS if name in fields}
-    return Picture(radiance, wavelengths, **counts)
+    return Picture(radiance, wavelengths, ceiling=fields.get("ceiling"), **counts)
 
 
 def _fields(picture: Picture) -> dict[str, Any]:
@@ -359,8 +365,10 @@ def _read_png(path: Path) -> dict[str, Any]:
     else:
         # Greys and palettes become red, green, blue and opacity of 8 bits on the way.
         rgba = iio.imread(data, plugin="pillow", extension=".png", mode="RGBA", index=0)
-    encoded = _opaque(rgba / np.float64(np.iinfo(rgba.dtype).max))
-    return {"radiance": decode_srgb(encoded)}
+    levels = np.float64(np.iinfo(rgba.dtype).max)
+    # The top code stands for all that is rounded to it, and for all that is brighter.
+    ceiling = float(decode_srgb(np.array((levels - 0.5) / levels)))
+    return {"radiance": decode_srgb(_opaque(rgba / levels)), "ceiling": ceiling}
 
 
 def _decode_png16(data: bytes, path: Path) -> np.ndarray:

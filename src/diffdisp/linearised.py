@@ -5,6 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from diffdisp.misfit import Clipped, Misfit, misfit
+
 
 class Columns(NamedTuple):
     """The derivatives of a picture: a Jacobian of which each channel holds few columns.
@@ -53,6 +55,7 @@ class Linearised(NamedTuple):
         explained: part of the variance of what depends on the index that the render explains.
         columns: J.
         picture: the render.
+        score: picture minus target; of clipped values what they tell of it.
     """
 
     r: Float[np.ndarray, "total total"]
@@ -67,6 +70,7 @@ class Linearised(NamedTuple):
     explained: float
     columns: Columns
     picture: Float[np.ndarray, "blocks channels"]
+    score: Float[np.ndarray, "blocks channels"]
 
     @property
     def weight(self) -> np.ndarray:
@@ -130,6 +134,7 @@ def linearise(
     columns: Columns,
     weights: Float[np.ndarray, "blocks 1"],
     widest: float,
+    clipped: Clipped | None = None,
 ) -> Linearised:
     """A picture and its derivatives, reduced to what a step needs.
 
@@ -139,24 +144,30 @@ def linearise(
         columns: its derivatives.
         weights: of each block's squared residuals, within [0, 1].
         widest: standard deviation of an other of which the picture says nothing, in its unit.
+        clipped: values of the target that were cut off, if any.
     """
-    plain, root = picture - target, np.sqrt(weights)
-    residual = plain * root
+    plain = picture - target
+    told = Misfit(plain, plain, np.ones_like(plain), plain**2)
+    if clipped is not None:
+        told = misfit(picture, target, clipped)
+    root = np.sqrt(weights * told.curvature)
+    residual, score = root * told.residual, np.sqrt(weights) * told.score
     seen = np.any(columns.of_index != 0, axis=-1).T
     count, total = int(seen.sum()), columns.total
-    effective = float(np.sum(seen * weights))
-    noise = float(np.sqrt(np.sum(residual[seen] ** 2) / max(effective - total, 1.0)))
+    effective = float(np.sum(seen * weights * told.curvature))
+    noise = float(np.sqrt(np.sum(score[seen] ** 2) / max(effective - total, 1.0)))
     contrast = np.sum((target[seen] - np.mean(target[seen])) ** 2) if count else 1.0
-    explained = 1 - float(np.sum(plain[seen] ** 2)) / max(float(contrast), 1e-300)
+    explained = 1 - float(np.sum(told.score[seen] ** 2)) / max(float(contrast), 1e-300)
     near = max(noise, 1e-9 * float(np.max(np.abs(target), initial=1e-300))) / widest
     # Each channel by itself, and then their triangles: most unknowns are of one channel alone.
-    basis, triangles = _qr(columns.values * root)
+    basis, triangles = _qr(columns.values * root.T[..., None])
     errors = residual.T
     q = np.einsum("cbk,cb->ck", basis, errors)
     meat, white = (
         np.einsum("cbk,cb,cbl->ckl", basis, squares, basis, optimize=True)
         for squares in (errors**2, np.broadcast_to(weights.T, errors.shape))
     )
+    # The variance of a clipped value's score is its curvature: the two are of one likelihood.
     channels, width = q.shape
     rows = np.zeros((channels * width + columns.others, total))
     within, without = (np.zeros((len(rows), len(rows))) for _ in range(2))
@@ -175,13 +186,14 @@ def linearise(
         whole.T @ within @ whole + held,
         whole.T @ without @ whole,
         held,
-        float(np.sum(residual**2)),
+        float(np.sum(weights * told.cost)),
         count,
         noise,
-        float(np.sqrt(np.mean(plain**2))),
+        float(np.sqrt(np.mean(told.score**2))),
         explained,
         columns,
         picture,
+        told.score,
     )
 
 
