@@ -295,6 +295,7 @@ def two_balls(glass: Sellmeier = BK7) -> Scene:
     ("scene", "options", "words"),
     [
         (bench(), {"prior": "guess"}, "prior 'guess': allowed are none, catalogue, fixed-c3"),
+        (bench(), {"loss": "cubes"}, "loss 'cubes': allowed are squares, robust"),
         (bench(), {"noise": 0.0}, "noise 0.0: must be a finite number above 0"),
         (bench(), {"noise": -1e-3}, "noise -0.001: must be a finite number above 0"),
         (bench(), {"noise": float("nan")}, "noise nan: must be a finite number above 0"),
@@ -402,6 +403,49 @@ def test_a_png_of_another_renderer():
     assert abs(result.n_d - float(truth.n_d)) <= min(2e-4, 3 * result.n_d_std)
     assert abs(result.V_d - float(truth.V_d)) <= min(1.0, 3 * result.V_d_std)
     assert result.nearest_glasses[0][0] == "N-BK7"
+
+
+# --- outliers
+
+
+def test_spoiled_pixels(visible):
+    target = with_noise(visible, 0)
+    spoiled = np.random.default_rng(100).random((SIZE, SIZE)) < 0.02
+    target.radiance[spoiled] += 0.5
+    squares, robust = (fit(bench(SILICA), target, loss=loss) for loss in ("squares", "robust"))
+    assert (squares.outliers, robust.outliers) == (0, 8 * np.sum(spoiled))
+    assert robust.converged, robust.message
+    assert robust.loss == "robust"
+    assert abs(robust.n_d - float(BK7.n_d)) < 3 * robust.n_d_std
+    assert abs(robust.V_d - float(BK7.V_d)) < 3 * robust.V_d_std
+    # Nearly as well known as without spoiled pixels, and by squares far off.
+    assert robust.n_d_std < 1.2e-4
+    assert abs(squares.n_d - float(BK7.n_d)) > 10 * robust.n_d_std
+    assert f" {robust.outliers} values are outliers" in robust.summary
+
+
+def test_a_robust_loss_costs_little_without_outliers(visible):
+    target = with_noise(visible, 3)
+    squares, robust = (
+        fit(bench(SILICA), target, loss=loss, noise=NOISE) for loss in ("squares", "robust")
+    )
+    # 5 % of the information is 2.6 % of the error. The spread and the mean slope of the loss rest
+    # on the few hundred values that show most of the index: 5 % each.
+    assert 0.96 < robust.n_d_std / squares.n_d_std < 1.1
+    assert "given noise of 0.01" in robust.summary
+    assert abs(robust.n_d - squares.n_d) < robust.n_d_std
+    assert robust.outliers < 10  # normal noise is beyond 4.685 sigma once in 360 000
+
+
+def test_a_robust_loss_on_a_clean_picture(visible):
+    spoiled = replace(visible, radiance=visible.radiance.copy())
+    spoiled.radiance[9, 12] += 0.5
+    result = fit(bench(SILICA), spoiled, loss="robust")
+    assert result.converged, result.message
+    # The noise taken is 1e-5 at least, of which a linear step leaves little.
+    assert abs(result.n_d - float(BK7.n_d)) < 1e-6
+    assert result.outliers == 8
+    assert "the picture is clean" in result.summary
 
 
 # --- a mask

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from diffdisp.linearised import Columns, linearise
-from diffdisp.misfit import Clipped, misfit
+from diffdisp.misfit import Clipped, Robust, misfit
 
 CHANNELS, BLOCKS, WIDEST = 3, 40, 3.0
 OTHERS, TOTAL = 6, 9
@@ -151,3 +151,26 @@ def test_no_value_is_clipped_where_none_is_marked(example):
     for had, has in zip(example.lin, linearise(*fixed, nowhere), strict=True):
         if not isinstance(had, Columns):
             np.testing.assert_allclose(has, had, rtol=1e-12)
+
+
+@pytest.mark.parametrize("robust", [Robust("huber", 0.4), Robust("tukey", 0.6)], ids=str)
+def test_a_robust_step_and_its_spread_are_those_of_an_m_estimate(robust):
+    example = Example(7)
+    fixed = example.picture, example.target, example.columns, example.weights, WIDEST
+    lin = linearise(*fixed, robust=robust)
+    part, slope, height = robust.influence(example.residual.reshape(BLOCKS, CHANNELS))
+    pulls = part.ravel() * example.residual
+    of_index = np.max(np.abs(example.jacobian[:, OTHERS:]), axis=1) ** 2
+    mean = np.average(slope.ravel(), weights=of_index)
+    assert 0.1 < mean < 0.9  # some are outliers
+    information = example.jacobian.T @ example.jacobian
+    near = np.diag([(lin.noise / WIDEST) ** 2] * OTHERS + [0.0] * (TOTAL - OTHERS))
+    # Sums of 120 products: rounding.
+    np.testing.assert_allclose(lin.r.T @ lin.r, information + near, rtol=1e-10, atol=1e-11)
+    right = example.jacobian.T @ pulls / mean
+    np.testing.assert_allclose(lin.r.T @ lin.q, right, rtol=1e-10, atol=1e-11)
+    spread = (example.jacobian * (pulls**2)[:, None]).T @ example.jacobian / mean**2
+    meat = lin.r.T @ (lin.meat - lin.held) @ lin.r
+    np.testing.assert_allclose(meat, spread, rtol=1e-9, atol=1e-11)
+    np.testing.assert_allclose(lin.cost, np.sum(height.ravel() * example.residual**2), rtol=1e-12)
+    np.testing.assert_array_equal(lin.score, example.picture - example.target)

@@ -311,6 +311,7 @@ BAD_FITS = {
     "no such object": (SCENE + TWO_BALLS, "--object third", "third"),
     "nothing of that name": (SCENE, "--free ball.centre", "'ball.centre'"),
     "unknown prior": (SCENE, "--prior strong", "--prior"),
+    "unknown loss": (SCENE, "--loss cubes", "--loss"),
     "no noise": (SCENE, "--noise 0", "above 0"),
     "negative noise": (SCENE, "--noise -1", "above 0"),
     "noise not finite": (SCENE, "--noise nan", "finite"),
@@ -713,15 +714,17 @@ def test_fit(scene, target, out, capsys, fitted):
     assert fitted["noise"] is None
     assert fitted["start"] is None
     assert fitted["mask"] is None
+    assert fitted["loss"] == "squares"
 
 
 def test_fit_options(scene, target, out, fitted):
     options = ["--object", "ball", "--prior", "fixed-c3", "--noise", "1e-3", "--start", "f2"]
-    options += ["--free", "ball.center", "--free", "gain"]
+    options += ["--free", "ball.center", "--free", "gain", "--loss", "robust"]
     assert main(["fit", scene, target, "-o", str(out), *options]) == 0
     assert (fitted["object_name"], fitted["prior"], fitted["noise"]) == ("ball", "fixed-c3", 1e-3)
     assert fitted["start"].name == "F2"
     assert fitted["free"] == ["ball.center", "gain"]
+    assert fitted["loss"] == "robust"
 
 
 def test_fit_with_a_mask(scene, target, tmp_path, out, fitted):
@@ -792,8 +795,9 @@ def test_compile_cache_of_somebody_else_is_kept(monkeypatch, tmp_path):
     assert not (tmp_path / "other").exists()
 
 
-def test_priors_are_those_of_the_fit():
+def test_choices_are_those_of_the_fit():
     assert command_line.PRIORS == fitting.PRIORS
+    assert command_line.LOSSES == fitting.LOSSES
 
 
 def test_help_and_version(capsys):

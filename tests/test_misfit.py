@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from jax.scipy.stats import norm
 
-from diffdisp.misfit import Clipped, misfit
+from diffdisp.misfit import Clipped, Robust, misfit
 
 SIGMA, LEAST = 0.02, 0.9
 RENDERS = LEAST + SIGMA * np.array([-3.0, -1.0, -0.2, 0.0, 0.3, 1.0, 3.0])
@@ -73,3 +73,39 @@ def test_far_from_the_bound_it_is_a_bound(noise):
     np.testing.assert_allclose(curvature[:3], 1.0, rtol=1.1 / 40**2)
     assert np.all(np.abs(score[3:]) < 1e-100)
     np.testing.assert_array_equal(curvature[3:] < 1e-100, True)
+
+
+KINDS = ["huber", "tukey"]
+
+
+def pull(kind, misfits):
+    """ψ(u), ψ'(u) and 2 ρ(u) of misfits at a spread of 1."""
+    part, slope, height = Robust(kind, 1.0).influence(values(misfits))
+    return part[0] * misfits, slope[0], height[0] * misfits**2
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_pulls_are_slopes_of_the_loss(kind):
+    u, h = np.concatenate([-np.geomspace(0.01, 60, 40), np.geomspace(0.01, 60, 40)]), 1e-5
+    ahead, behind = pull(kind, u + h), pull(kind, u - h)
+    psi, slope, _ = pull(kind, u)
+    # Central differences: h² = 1e-10 of the third derivative, rounding of 60² · 1e-16 / h.
+    np.testing.assert_allclose((ahead[2] - behind[2]) / (4 * h), psi, atol=3e-8)
+    np.testing.assert_allclose((ahead[0] - behind[0]) / (2 * h), slope, atol=3e-8)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_normal_noise_costs_a_twentieth(kind):
+    u = np.linspace(-9, 9, 20001)
+    density = np.exp(-(u**2) / 2) / np.sum(np.exp(-(u**2) / 2))
+    psi, slope, _ = pull(kind, u)
+    efficiency = np.sum(slope * density) ** 2 / np.sum(psi**2 * density)
+    # The constants of Holland and Welsch are rounded to three decimals.
+    assert efficiency == pytest.approx(0.95, abs=1e-3)
+
+
+def test_what_is_far_off():
+    far = np.array([1e3, -1e6])
+    np.testing.assert_allclose(pull("huber", far)[0], [1.345, -1.345], rtol=1e-12)
+    np.testing.assert_array_equal(pull("tukey", far)[0], 0.0)
+    np.testing.assert_allclose(pull("tukey", far)[2], 4.685**2 / 3, rtol=1e-12)

@@ -22,8 +22,9 @@ KEYS = {
     *("converged", "message", "steps", "B", "C", "B_std", "C_std", "covariance", "n_d"),
     *("n_d_std", "V_d", "V_d_std", "P_gF", "wavelength", "n", "n_std", "singular_values"),
     *("determined", "summary", "rms_residual", "nearest_glasses"),
-    *("object", "prior", "P_gF_std", "free", "left_out"),
+    *("object", "prior", "P_gF_std", "free", "left_out", "loss"),
 }
+LEFT_OUT = ("masked_pixels", "clipped_values", "outlying_values")
 
 
 def size_of(path):
@@ -181,11 +182,11 @@ def test_report_shows_the_residual(tmp_path):
 
 def test_what_a_mask_left_out_is_told_and_not_drawn(tmp_path):
     used = np.ones((32, 32), bool)
-    assert fit_json(fake_result())["left_out"] == {"masked_pixels": 0, "clipped_values": 0}
+    assert fit_json(fake_result())["left_out"] == dict.fromkeys(LEFT_OUT, 0)
     assert "left out" not in result_table(fake_result())
     used[4:8, 4:8] = False
-    result = fake_result(used=used, clipped=7)
-    assert fit_json(result)["left_out"] == {"masked_pixels": 16, "clipped_values": 7}
+    result = fake_result(used=used, clipped=7, outliers=9)
+    assert fit_json(result)["left_out"] == dict(zip(LEFT_OUT, (16, 7, 9), strict=True))
     assert "left out   16 pixels by the mask\n" in result_table(result)
     write_report(tmp_path / "a.png", result, fake_target())
     # What a masked pixel holds changes neither the picture of the residual nor its scale.

@@ -18,7 +18,7 @@ from typing import Any, NoReturn
 DONE, BAD_INPUT, NOT_CONVERGED, INTERRUPTED = 0, 2, 3, 130
 """Exit statuses; 130 is what shells give for Ctrl-C."""
 
-PRIORS = ("none", "catalogue", "fixed-c3")
+PRIORS, LOSSES = ("none", "catalogue", "fixed-c3"), ("squares", "robust")
 """Those of `fitting`, which is too heavy to be asked."""
 
 QUALITY = {"draft": 4, "standard": 16, "reference": 256}
@@ -174,6 +174,7 @@ def _add_fit(parser: argparse.ArgumentParser) -> None:
     add("--object", metavar="NAME", help="the ball, where the scene has several of glass")
     add("--free", action="append", default=[], metavar="NAME", help=_FREE_HELP)
     add("--prior", choices=PRIORS, default="none", help="what is known beforehand (default none)")
+    add("--loss", choices=LOSSES, default="squares", help="robust: outliers do not count")
     add("--noise", type=_noise, metavar="SIGMA", help="of the radiance (default: estimated)")
     add("--start", metavar="GLASS", help="glass to start from (default: that of the scene)")
     add(
@@ -405,6 +406,7 @@ def _fit(options: argparse.Namespace) -> int:
             noise=options.noise,
             start=start,
             mask=mask,
+            loss=options.loss,
             progress=progress,
         )
     folder.mkdir(parents=True, exist_ok=True)

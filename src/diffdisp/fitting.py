@@ -45,7 +45,7 @@ from diffdisp.glasses import glass_table
 from diffdisp.image import Picture
 from diffdisp.integrator import Lanes, followed_radiance, lane_radiance
 from diffdisp.linearised import Columns, Eliminated, Linearised, linearise
-from diffdisp.misfit import Clipped
+from diffdisp.misfit import Clipped, Robust
 from diffdisp.parameters import Parameter, Place, named_parameters, value_at, with_coordinates
 from diffdisp.planning import Plan, make_plan
 from diffdisp.programs import OPTIONS
@@ -128,6 +128,12 @@ to all of them alike."""
 
 PRIORS = ("none", "catalogue", "fixed-c3")
 
+LOSSES = ("squares", "robust")
+
+SETTLE, SETTLED = 100, 0.01
+"""Steps at most, on one traced picture, of what is no least-squares problem: until one changes the
+picture by less than this part of its noise."""
+
 COLOR_WAVELENGTHS = np.arange(430, 681, 10) / 1e3
 """Where a fit to a colour picture reports n(λ), µm: beyond, sRGB sees almost nothing."""
 
@@ -184,6 +190,8 @@ class FitResult:
         free: what else was free.
         used: (height, width) pixels that the fit went by; None where it was all of them.
         clipped: how many of their values were cut off and count as "at least that bright".
+        loss: "squares" or "robust".
+        outliers: how many values the robust loss left out at the end.
     """
 
     scene: Scene
@@ -218,6 +226,8 @@ class FitResult:
     free: tuple[FreeValue, ...] = ()
     used: np.ndarray | None = None
     clipped: int = 0
+    loss: str = "squares"
+    outliers: int = 0
 
     @property
     def masked(self) -> int:
@@ -371,6 +381,7 @@ class Problem(NamedTuple):
         ceiling: from which on values are clipped; infinity where none are.
         unknowns: what is looked for.
         free: what else is.
+        loss: one of `LOSSES`.
         progress: called with the step, the root mean square residual and n_d.
     """
 
@@ -383,6 +394,7 @@ class Problem(NamedTuple):
     ceiling: float
     unknowns: Unknowns
     free: Free
+    loss: str
     progress: Callable[[int, float, float], None]
 
 
@@ -421,6 +433,7 @@ class Level(NamedTuple):
         weights: (blocks, 1) of the squared residuals.
         seed: of the render.
         clipped: values of the target that were cut off; None where there are none.
+        robust: the loss; None for squares.
     """
 
     blocks: np.ndarray
@@ -429,6 +442,7 @@ class Level(NamedTuple):
     weights: np.ndarray
     seed: int
     clipped: Clipped | None
+    robust: Robust | None
 
 
 def fit(
@@ -441,6 +455,7 @@ def fit(
     noise: float | None = None,
     start: Sellmeier | None = None,
     mask: np.ndarray | None = None,
+    loss: str = "squares",
     progress: Callable[[int, float, float], None] | None = None,
 ) -> FitResult:
     """The Sellmeier coefficients of a glass ball from a picture of it, in float64.
@@ -463,6 +478,9 @@ def fit(
         start: a glass to start from instead of the scene's.
         mask: (height, width) of the target; pixels where it is zero or False are left out of the
             fit and of its errors. They may hold anything, NaN too.
+        loss: "squares"; or "robust", by which values far off what most others show, in units of
+            their spread, pull no stronger (Huber) on the way and not at all (Tukey) in the end.
+            Errors are then those of the M-estimate.
         progress: called with the step, the root mean square residual and n_d.
 
     Returns:
@@ -476,6 +494,8 @@ def fit(
     """
     if prior not in PRIORS:
         raise ValueError(f"prior {prior!r}: allowed are {', '.join(PRIORS)}")
+    if loss not in LOSSES:
+        raise ValueError(f"loss {loss!r}: allowed are {', '.join(LOSSES)}")
     if noise is not None and not (np.isfinite(noise) and noise > 0):
         raise ValueError(f"noise {noise}: must be a finite number above 0")
     number = _glass_object(scene, object_name)
@@ -485,7 +505,7 @@ def fit(
     used = _used(target, mask)
     target = replace(target, radiance=np.where(used[..., None], target.radiance, 0.0))
     with jax.enable_x64(True):
-        problem = _problem(scene, number, target, used, free, prior, progress or _silent)
+        problem = _problem(scene, number, target, used, free, prior, loss, progress or _silent)
         return _fit(problem, target, prior, noise)
 
 
@@ -529,6 +549,7 @@ def _problem(
     used: np.ndarray,
     free: Sequence[str],
     prior: str,
+    loss: str,
     progress: Callable[[int, float, float], None],
 ) -> Problem:
     film = target.film
@@ -554,8 +575,19 @@ def _problem(
     unknowns = Unknowns(coefficients, reference, project, mean, rows)
     others = _free(scene, number, target, free)
     ceiling = np.inf if target.ceiling is None else target.ceiling
-    picture = target.radiance
-    return Problem(scene, number, ball, film, picture, used, ceiling, unknowns, others, progress)
+    return Problem(
+        scene,
+        number,
+        ball,
+        film,
+        target.radiance,
+        used,
+        ceiling,
+        unknowns,
+        others,
+        loss,
+        progress,
+    )
 
 
 def _free(scene: Scene, number: int, target: Picture, names: Sequence[str]) -> Free:
@@ -623,7 +655,9 @@ def _level(
     share = share[blocks]
     part = _part(problem, size, samples, depth, blocks, np.arange(len(blocks)), split)
     target = means(problem.target)[blocks] / share
-    return Level(blocks, (part,), target, share, seed, _clipped(problem, means, blocks, share))
+    clipped = _clipped(problem, means, blocks, share)
+    robust = Robust("huber", problem.free.brightest) if problem.loss == "robust" else None
+    return Level(blocks, (part,), target, share, seed, clipped, robust)
 
 
 def _clipped(
@@ -805,22 +839,65 @@ def _linearise(
 
 def _reduced(level: Level, picture: np.ndarray, columns: Columns) -> Linearised:
     """A level's picture and its slopes, reduced to what a step needs."""
-    return linearise(picture, level.target, columns, level.weights, WIDEST, level.clipped)
+    told = level.clipped, level.robust
+    return linearise(picture, level.target, columns, level.weights, WIDEST, *told)
 
 
 def _rescaled(level: Level, lin: Linearised, brightest: float) -> tuple[Level, Linearised]:
-    """A level with the noise that its picture shows, where clipped values have to know it.
+    """A level with the noise that its picture shows, where its misfits have to know it.
 
-    1.4826 median deviations of normal noise are its standard deviation. The median is that of
-    flat parts of a picture, where most clipped values are.
+    The median for clipped values is that of flat parts of a picture, where most of them are; the
+    one for a robust loss goes by what each value tells of the index, since noise on edges, where
+    the index shows, is often larger and no outlier.
     """
-    if level.clipped is None:
+    if level.clipped is None and level.robust is None:
         return level, lin
-    ordinary = np.abs(lin.score)[~level.clipped.where]
-    median = float(np.median(ordinary)) if ordinary.size else 0.0
-    noise = max(1.4826 * median, CLEAN * brightest)
-    level = level._replace(clipped=level.clipped._replace(noise=noise))
+    least = CLEAN * brightest
+    if level.clipped is not None:
+        ordinary = np.abs(lin.score)[~level.clipped.where]
+        noise = max(_deviation(ordinary, np.ones_like(ordinary)), least)
+        level = level._replace(clipped=level.clipped._replace(noise=noise))
+    if level.robust is not None:
+        spread = max(_deviation(_weighed(level, lin), lin.weight**2), least)
+        level = level._replace(robust=level.robust._replace(spread=spread))
     return level, _reduced(level, lin.picture, lin.columns)
+
+
+def _weighed(level: Level, lin: Linearised) -> np.ndarray:
+    """Size (blocks, channels) of what a robust loss takes."""
+    return np.abs(lin.score) * np.sqrt(level.weights)
+
+
+def _deviation(sizes: np.ndarray, counts: np.ndarray) -> float:
+    """Standard deviation of normal noise by the median of its sizes, each as often as it counts.
+
+    1.4826 = 1 / Φ⁻¹(3/4) median deviations are the standard deviation.
+    """
+    sizes, counts = sizes[counts > 0], counts[counts > 0]
+    if not sizes.size:
+        return 0.0
+    order = np.argsort(sizes)
+    part = np.cumsum(counts[order]) / np.sum(counts)
+    return float(1.4826 * sizes[order][np.searchsorted(part, 0.5)])
+
+
+def _settled(
+    problem: Problem, level: Level, at: Point, anchor: np.ndarray, lin: Linearised
+) -> tuple[Level, Point, Linearised]:
+    """Where the least misfit lies if the picture is linear: steps without tracing.
+
+    Squares need one step. What clipped values and outliers pull changes on the way.
+    """
+    for _ in range(SETTLE):
+        new, change = _next_point(problem.unknowns, at, anchor, lin, 0.0)
+        if level.clipped is None and level.robust is None:
+            return level, new, lin.moved(change)
+        visible = np.linalg.norm(lin.r @ change)
+        moved = _reduced(level, lin.picture + lin.columns.along(change), lin.columns)
+        at, (level, lin) = new, _rescaled(level, moved, problem.free.brightest)
+        if visible < SETTLED * lin.noise:
+            break
+    return level, at, lin
 
 
 class Step(NamedTuple):
@@ -925,12 +1002,14 @@ class Descent(NamedTuple):
         lin: the picture linearised there.
         steps: pictures traced.
         converged: whether a next step would change nothing that the picture can tell.
+        spread: of misfits that are no outliers, where the loss is robust; else 0.
     """
 
     at: Point
     lin: Linearised
     steps: int
     converged: bool
+    spread: float
 
 
 def _descend(
@@ -972,11 +1051,8 @@ def _descend(
         largest, visible = _largest(unknowns, at, new), np.linalg.norm(lin.r @ change)
         if largest < least or visible < small * lin.noise:
             # So near the picture is linear: it need not be traced again.
-            if level.clipped is None:
-                lin = lin.moved(change)
-            else:
-                lin = _reduced(level, lin.picture + lin.columns.along(change), lin.columns)
-            at, converged = new, True
+            level, at, lin = _settled(problem, level, at, anchor, lin)
+            converged = True
             break
         if damping:
             new, change = _next_point(unknowns, at, anchor, lin, damping)
@@ -997,7 +1073,7 @@ def _descend(
             level, lin = _rescaled(level, tried, brightest)
         else:
             damping = max(10 * damping, 1.0)
-    return Descent(at, lin, steps, converged)
+    return Descent(at, lin, steps, converged, level.robust.spread if level.robust else 0.0)
 
 
 def _largest(unknowns: Unknowns, at: Point, new: Point) -> float:
@@ -1055,9 +1131,8 @@ def _refined(problem: Problem, few: Descent, level: Level, depth: int) -> tuple[
     error = np.max(np.abs(some.picture - few.lin.picture), axis=1, keepdims=True) / 3
     error[hard] /= SPLITS[1] ** 2 / SPLITS[0] ** 2
     residual = np.abs(some.score)[some.weight > 0]
-    # 1.4826 median deviations of normal noise are its standard deviation.
-    median = float(np.median(residual)) if residual.size else 0.0
-    sigma = max(1.4826 * median, CLEAN * problem.free.brightest)
+    shown = _deviation(residual, np.ones_like(residual))
+    sigma = max(shown, CLEAN * problem.free.brightest)
     weights = 1 / (1 + (error / sigma) ** 2)
     if problem.free.parameters:
         weights *= _resolved(problem, level.blocks, few.lin.columns, some.columns)
@@ -1260,6 +1335,10 @@ def _fit(problem: Problem, target: Picture, prior: str, noise: float | None) -> 
     if problem.free.parameters and best.converged:
         polished = _descend(problem, level, best.at, CUTOFF, POLISH, SMALL_STEP, along)
         best = polished._replace(steps=best.steps + polished.steps, converged=True)
+    if level.robust is not None:
+        level = level._replace(robust=Robust("tukey", best.spread))
+        cut = _descend(problem, level, best.at, CUTOFF, 30, LINEAR_STEP, along)
+        best = cut._replace(steps=best.steps + cut.steps)
     error = best.lin.noise / max(float(np.max(np.abs(best.lin.eliminated().r))), 1e-300)
     if NEGLECTED * CUTOFF > SMALL_STEP * error:
         # So clean a picture shows the light of the paths that were ended early.
@@ -1282,6 +1361,9 @@ def _result(
     unknowns, lin, film, free = problem.unknowns, end.lin, problem.film, problem.free
     z = jnp.asarray(end.at.z)
     meat, noise, source = _noise(lin, given, float(np.max(np.abs(problem.target))))
+    if given is not None and level.robust is not None and meat is not lin.meat:
+        # A robust loss pays a little information, and outliers take some.
+        meat = meat * (max(lin.noise, given) / given) ** 2
     if free.names:
         source += f", and with {' and '.join(free.names)} free"
     whole = _covariance(unknowns, z, lin, meat, noise)
@@ -1307,6 +1389,10 @@ def _result(
     left, within = lin.eliminated(), meat[free.total :, free.total :]
     scene = _with_others(problem, end.at.others)
     clipped = int(np.sum(problem.target >= problem.ceiling))
+    outliers = 0
+    if end.spread and level.robust is not None:
+        off = _weighed(level, lin) > end.spread * level.robust.cut
+        outliers = int(np.sum(off))
     return FitResult(
         scene=with_glass(scene, problem.number, glass),
         glass=glass,
@@ -1332,6 +1418,7 @@ def _result(
         determined=determined,
         summary=_summary(waves, n_std, determined, len(singular), source, prior, own)
         + _clipped_words(clipped, problem.ceiling)
+        + _outlier_words(outliers)
         + (UNDERSTATED if free.parameters else ""),
         rms_residual=lin.rms,
         nearest_glasses=_nearest(unknowns, end.at.z, left, within),
@@ -1342,6 +1429,8 @@ def _result(
         free=tuple(_free_values(free, scene, end.at.others, np.sqrt(np.diag(whole)))),
         used=None if problem.used.all() else problem.used,
         clipped=clipped,
+        loss=problem.loss,
+        outliers=outliers,
     )
 
 
@@ -1522,3 +1611,11 @@ def _clipped_words(count: int, ceiling: float) -> str:
         return ""
     values = "1 value of the target is" if count == 1 else f"{count} values of the target are"
     return f" {values} clipped: known to be at least {ceiling:.3g}, and no more."
+
+
+def _outlier_words(count: int) -> str:
+    """How many values a robust loss left out, if any."""
+    if not count:
+        return ""
+    values = "1 value of the target is an outlier" if count == 1 else f"{count} values are outliers"
+    return f" {values}, and left out by the robust loss."

@@ -5,7 +5,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from diffdisp.misfit import Clipped, Misfit, misfit
+from diffdisp.misfit import Clipped, Misfit, Robust, misfit
+
+LEAST_SLOPE = 0.1
+"""Mean slope of a robust loss at which nine tenths of all misfits would be outliers: no less."""
 
 
 class Columns(NamedTuple):
@@ -135,6 +138,7 @@ def linearise(
     weights: Float[np.ndarray, "blocks 1"],
     widest: float,
     clipped: Clipped | None = None,
+    robust: Robust | None = None,
 ) -> Linearised:
     """A picture and its derivatives, reduced to what a step needs.
 
@@ -145,6 +149,13 @@ def linearise(
         weights: of each block's squared residuals, within [0, 1].
         widest: standard deviation of an other of which the picture says nothing, in its unit.
         clipped: values of the target that were cut off, if any.
+        robust: what takes the place of squares, if anything. Residuals are then what pulls of
+            each, over the mean slope of that pull: a step, q and meat are those of the
+            M-estimate, and only `picture`, `score` and `rms` know the outliers as they are.
+
+    Source:
+        Huber, Robust Statistics (Wiley, 1981): modified residuals, section 7.8; the covariance of
+        an M-estimate, section 7.6, here without equal variances.
     """
     plain = picture - target
     told = Misfit(plain, plain, np.ones_like(plain), plain**2)
@@ -152,12 +163,20 @@ def linearise(
         told = misfit(picture, target, clipped)
     root = np.sqrt(weights * told.curvature)
     residual, score = root * told.residual, np.sqrt(weights) * told.score
+    cost, pull = weights * told.cost, np.ones_like(plain)
+    if robust is not None:
+        pull, slope, height = robust.influence(score)
+        cost = cost * height
+        # Where the index shows most, the slopes of the pulls count most.
+        count = np.max(np.abs(columns.of_index), axis=-1).T ** 2 * weights * told.curvature
+        mean = float(np.sum(slope * count) / max(np.sum(count), 1e-300))
+        residual, score = (pull / max(mean, LEAST_SLOPE) * off for off in (residual, score))
     seen = np.any(columns.of_index != 0, axis=-1).T
     count, total = int(seen.sum()), columns.total
     effective = float(np.sum(seen * weights * told.curvature))
     noise = float(np.sqrt(np.sum(score[seen] ** 2) / max(effective - total, 1.0)))
     contrast = np.sum((target[seen] - np.mean(target[seen])) ** 2) if count else 1.0
-    explained = 1 - float(np.sum(told.score[seen] ** 2)) / max(float(contrast), 1e-300)
+    explained = 1 - float(np.sum((pull * told.score)[seen] ** 2)) / max(float(contrast), 1e-300)
     near = max(noise, 1e-9 * float(np.max(np.abs(target), initial=1e-300))) / widest
     # Each channel by itself, and then their triangles: most unknowns are of one channel alone.
     basis, triangles = _qr(columns.values * root.T[..., None])
@@ -186,7 +205,7 @@ def linearise(
         whole.T @ within @ whole + held,
         whole.T @ without @ whole,
         held,
-        float(np.sum(weights * told.cost)),
+        float(np.sum(cost)),
         count,
         noise,
         float(np.sqrt(np.mean(told.score**2))),

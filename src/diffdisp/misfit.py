@@ -83,3 +83,49 @@ def misfit(
             )
         )
     )
+
+
+class Robust(NamedTuple):
+    """A loss that is a square for small misfits and lets outliers count for less.
+
+    Args:
+        kind: "huber", beyond whose cut a misfit pulls no stronger: convex, so that it can be
+            trusted far from the answer; or "tukey", beyond whose cut it does not pull at all.
+        spread: standard deviation of misfits that are no outliers.
+    """
+
+    kind: str
+    spread: float
+
+    @property
+    def cut(self) -> float:
+        """Where outliers begin, in spreads: normal noise then costs 5 % of the information.
+
+        Source:
+            Holland and Welsch, Commun. Statist. A 6 (1977) 813, table 1.
+        """
+        return {"huber": 1.345, "tukey": 4.685}[self.kind]
+
+    def influence(
+        self, misfits: Float[np.ndarray, "blocks channels"]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """How a misfit pulls, as parts of how it would as a square.
+
+        Args:
+            misfits: weighed.
+
+        Returns:
+            ψ(u) / u, the slope ψ'(u), and 2 ρ(u) / u², where u is a misfit in spreads.
+
+        Source:
+            Huber, Robust Statistics (Wiley, 1981), section 7.3; Beaton and Tukey,
+            Technometrics 16 (1974) 147, the biweight.
+        """
+        part = np.abs(misfits) / (self.spread * self.cut)
+        inside = part <= 1
+        over = np.where(inside, 1.0, part)
+        if self.kind == "huber":
+            return 1 / over, 1.0 * inside, (2 - 1 / over) / over
+        left = np.where(inside, 1 - part**2, 0.0)
+        third = np.where(inside, 1 - part**2 + part**4 / 3, 1 / (3 * over**2))
+        return left**2, left * np.where(inside, 1 - 5 * part**2, 0.0), third

@@ -68,7 +68,12 @@ def fit_json(result: FitResult) -> dict[str, Any]:
         "determined": int(result.determined),
         "summary": result.summary,
         "rms_residual": _plain(result.rms_residual),
-        "left_out": {"masked_pixels": result.masked, "clipped_values": result.clipped},
+        "loss": result.loss,
+        "left_out": {
+            "masked_pixels": result.masked,
+            "clipped_values": result.clipped,
+            "outlying_values": result.outliers,
+        },
         "nearest_glasses": [
             {"name": name, "distance": _plain(distance)}
             for name, distance in result.nearest_glasses
