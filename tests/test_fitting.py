@@ -19,6 +19,7 @@ from diffdisp.fitting import (
     Unknowns,
     _covariance,
     _in_order,
+    _probabilities,
     fit,
 )
 from diffdisp.glasses import glass_table, named_glass
@@ -605,6 +606,51 @@ def test_what_nothing_tells_is_said_to_be_unknown(visible):
     assert (lean.name, lean.value) == ("camera.up.z", 0.0)
     assert lean.std == pytest.approx(3.0, rel=1e-9)
     assert index_error(result, BK7) < 1e-9  # as without it
+
+
+# --- naming
+
+
+def test_one_glass_of_two():
+    # In one dimension, by hand: N(0; a, 1) of each, and N(0; 0, 1 + 2 a²) of any other.
+    offsets = np.array([[-1.5], [1.5]])
+    at, other = np.exp(-(1.5**2) / 2), 1 / np.sqrt(1 + 2 * 1.5**2)
+    likely, left = _probabilities(offsets)
+    np.testing.assert_allclose(likely, np.full(2, at / 2 / (at + other)), rtol=1e-12)
+    assert left == pytest.approx(other / (at + other), rel=1e-12)
+
+
+def test_another_glass_is_spread_as_the_table():
+    offsets = np.random.default_rng(1).normal(size=(9, 2)) * [4.0, 0.7] + [1.0, -2.0]
+    likely, left = _probabilities(offsets)
+    mean, precision = offsets.mean(0), np.linalg.inv(np.cov(offsets.T))
+    x = np.stack(np.meshgrid(np.linspace(-30, 30, 1201), np.linspace(-8, 8, 641)), -1)
+    off = x - mean
+    spread = np.exp(-np.sum((off @ precision) * off + x**2, axis=-1) / 2)
+    other = np.sum(spread) * 0.05 * 0.025 * np.sqrt(np.linalg.det(precision)) / (2 * np.pi)
+    each = np.exp(-np.sum(offsets**2, axis=1) / 2) / 9
+    # A sum over a grid much finer than the widths of smooth functions is the integral.
+    np.testing.assert_allclose(likely, each / (np.sum(each) + other), rtol=1e-6)
+    np.testing.assert_allclose(left, other / (np.sum(each) + other), rtol=1e-6)
+
+
+def test_who_knows_nothing_says_so():
+    likely, other = _probabilities(np.zeros((4, 3)))
+    np.testing.assert_allclose(likely, 1 / 8, rtol=1e-15)
+    assert other == 0.5
+    assert _probabilities(np.array([[1e9, 1e9], [1e9, -1e9]]))[1] == 1.0
+
+
+def test_a_glass_of_the_table_and_one_that_is_not(visible):
+    result = fit(bench(SILICA), with_noise(visible, 0))
+    assert len(result.probabilities) == len(result.nearest_glasses) == 5
+    assert result.probabilities[0] > 0.99  # its neighbours are hundreds of sigma away
+    assert sum(result.probabilities) + result.other_probability == pytest.approx(1, abs=1e-9)
+    # A melt that is off by 0.001, ten sigma.
+    melt = Sellmeier(np.asarray(BK7.B) * 1.0024, BK7.C)
+    other = fit(bench(SILICA), with_noise(own_target(bench(melt), VISIBLE), 0))
+    assert other.nearest_glasses[0][0] == "N-BK7"
+    assert other.other_probability > 0.99
 
 
 # --- progress, and JAX's switches

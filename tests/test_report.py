@@ -22,7 +22,7 @@ KEYS = {
     *("converged", "message", "steps", "B", "C", "B_std", "C_std", "covariance", "n_d"),
     *("n_d_std", "V_d", "V_d_std", "P_gF", "wavelength", "n", "n_std", "singular_values"),
     *("determined", "summary", "rms_residual", "nearest_glasses"),
-    *("object", "prior", "P_gF_std", "free", "left_out", "loss"),
+    *("object", "prior", "P_gF_std", "free", "left_out", "loss", "other_glass_probability"),
 }
 LEFT_OUT = ("masked_pixels", "clipped_values", "outlying_values")
 
@@ -66,6 +66,24 @@ def test_what_was_free_is_told():
     assert "gain[" not in table
     one = result_table(fake_result(free=(FreeValue("gain[0]", 1.1, 2e-3),)))
     assert "gain       1.1000 ± 0.0020\n" in one
+
+
+def test_how_likely_the_nearest_glasses_are(tmp_path):
+    likely = (0.91, 0.0849, 3e-4, 0.0, 0.0)
+    result = fake_result(probabilities=likely, other_probability=0.0048)
+    told = fit_json(result)
+    assert [entry["probability"] for entry in told["nearest_glasses"]] == list(likely)
+    assert [set(entry) for entry in told["nearest_glasses"]] == [
+        {"name", "distance", "probability"}
+    ] * 5
+    assert told["other_glass_probability"] == 0.0048
+    first, second = (name for name, _ in result.nearest_glasses[:2])
+    line = f"glass      {first} 0.910, {second} 0.085, none of the table 0.005\n"
+    assert line in result_table(result)
+    assert "glass  " not in result_table(fake_result())
+    write_report(tmp_path / "a.png", result, fake_target())
+    write_report(tmp_path / "b.png", fake_result(), fake_target())
+    assert (tmp_path / "a.png").read_bytes() != (tmp_path / "b.png").read_bytes()
 
 
 def test_json_has_null_for_what_is_not_finite(tmp_path):

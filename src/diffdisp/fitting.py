@@ -192,6 +192,8 @@ class FitResult:
         clipped: how many of their values were cut off and count as "at least that bright".
         loss: "squares" or "robust".
         outliers: how many values the robust loss left out at the end.
+        probabilities: of `nearest_glasses`, that the ball is made of each.
+        other_probability: that it is of none of the table.
     """
 
     scene: Scene
@@ -228,6 +230,8 @@ class FitResult:
     clipped: int = 0
     loss: str = "squares"
     outliers: int = 0
+    probabilities: tuple[float, ...] = ()
+    other_probability: float = float("nan")
 
     @property
     def masked(self) -> int:
@@ -1387,6 +1391,7 @@ def _result(
     glass = Sellmeier(B, C, object_glass(problem.scene, problem.number).validity)
     converged, message = _verdict(end)
     left, within = lin.eliminated(), meat[free.total :, free.total :]
+    named, other = _named(unknowns, end.at.z, left, within)
     scene = _with_others(problem, end.at.others)
     clipped = int(np.sum(problem.target >= problem.ceiling))
     outliers = 0
@@ -1421,7 +1426,7 @@ def _result(
         + _outlier_words(outliers)
         + (UNDERSTATED if free.parameters else ""),
         rms_residual=lin.rms,
-        nearest_glasses=_nearest(unknowns, end.at.z, left, within),
+        nearest_glasses=tuple((name, distance) for name, distance, _ in named[:5]),
         prior=prior,
         noise=given,
         samples=tuple(part.plan.samples * part.split**2 for part in level.parts),
@@ -1431,6 +1436,8 @@ def _result(
         clipped=clipped,
         loss=problem.loss,
         outliers=outliers,
+        probabilities=tuple(probability for _, _, probability in named[:5]),
+        other_probability=other,
     )
 
 
@@ -1563,20 +1570,61 @@ def _verdict(end: Descent) -> tuple[bool, str]:
     return True, f"a minimum was reached in {end.steps} steps"
 
 
-def _nearest(
+def _named(
     unknowns: Unknowns, z: np.ndarray, left: Eliminated, meat: np.ndarray
-) -> tuple[tuple[str, float], ...]:
-    """The five nearest glasses of the table, in standard deviations of what the picture tells."""
+) -> tuple[list[tuple[str, float, float]], float]:
+    """The glasses of the table, nearest first, and the probability that it is none of them.
+
+    Returns:
+        Names, distances in standard deviations of what the picture tells, and probabilities; and
+        that of any other glass.
+    """
     fitted = np.asarray(unknowns.coefficients.index(z, unknowns.reference))
     low, high = float(unknowns.coefficients.low), float(unknowns.coefficients.high)
-    spread = np.linalg.pinv(meat, hermitian=True)
-    found = []
-    for name, glass in glass_table().items():
-        if domain_error(glass, low, high):
-            continue
-        off = left.r @ unknowns.project @ (np.asarray(glass.indices(unknowns.reference)) - fitted)
-        found.append((name, float(np.sqrt(max(off @ spread @ off, 0.0)))))
-    return tuple(sorted(found, key=lambda entry: entry[1])[:5])
+    values, vectors = np.linalg.eigh(np.linalg.pinv(meat, hermitian=True))
+    whiten = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T @ left.r @ unknowns.project
+    table = {
+        name: whiten @ (np.asarray(glass.indices(unknowns.reference)) - fitted)
+        for name, glass in glass_table().items()
+        if not domain_error(glass, low, high)
+    }
+    if not table:
+        return [], 1.0
+    probabilities, other = _probabilities(np.stack(list(table.values())))
+    distances = (float(np.linalg.norm(off)) for off in table.values())
+    found = zip(table, distances, probabilities.tolist(), strict=True)
+    return sorted(found, key=lambda entry: entry[1]), other
+
+
+def _probabilities(
+    offsets: Float[np.ndarray, "glasses k"],
+) -> tuple[Float[np.ndarray, " glasses"], float]:
+    """The probability of each glass, and that it is another one.
+
+    Each glass of the table is as likely beforehand as any other, and one that is not in it as
+    likely as all of them together. What is not in it is spread as the table is: normally, with its
+    mean and covariance. So another glass explains any picture a little, the less the better the
+    picture tells glasses apart.
+
+    Args:
+        offsets: of each glass from the fit, in coordinates in which the error is 1 in every
+            direction.
+
+    Source:
+        MacKay, Information Theory, Inference, and Learning Algorithms (Cambridge, 2003), ch. 28.
+    """
+    count, k = offsets.shape
+    mean, spread = offsets.mean(axis=0), np.eye(k)
+    if count > 1:
+        spread = spread + np.atleast_2d(np.cov(offsets.T))
+    _, size = np.linalg.slogdet(spread)
+    logs = np.append(
+        -np.sum(offsets**2, axis=1) / 2 - np.log(count),
+        -(mean @ np.linalg.solve(spread, mean) + size) / 2,
+    )
+    likely = np.exp(logs - np.max(logs))
+    likely /= np.sum(likely)
+    return likely[:-1], float(likely[-1])
 
 
 def _summary(

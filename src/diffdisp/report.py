@@ -24,6 +24,9 @@ from diffdisp.image import Picture, linear_rgb, replacing
 UNDETERMINED = 0.1
 """Relative standard error of a coefficient from which on the picture does not determine it."""
 
+LEAST_PROBABILITY = 5e-4
+"""What the table shows of a probability is rounded to 0.001."""
+
 PLOT_LIMITS = (0.1, 50.0)
 """Wavelengths that a plot of a glass shows at most, µm."""
 UNSTATED_RANGE = (0.3, 2.5)
@@ -74,15 +77,20 @@ def fit_json(result: FitResult) -> dict[str, Any]:
             "clipped_values": result.clipped,
             "outlying_values": result.outliers,
         },
-        "nearest_glasses": [
-            {"name": name, "distance": _plain(distance)}
-            for name, distance in result.nearest_glasses
-        ],
+        "nearest_glasses": list(_nearest_entries(result)),
+        "other_glass_probability": _plain(result.other_probability),
         "free": [
             {"name": name, "value": _plain(value), "std": _plain(std)}
             for name, value, std in result.free
         ],
     }
+
+
+def _nearest_entries(result: FitResult) -> Iterator[dict[str, Any]]:
+    """Name, distance and, where it is known, probability of each near glass."""
+    for i, (name, distance) in enumerate(result.nearest_glasses):
+        known = [("probability", _plain(p)) for p in result.probabilities[i : i + 1]]
+        yield {"name": name, "distance": _plain(distance), **dict(known)}
 
 
 def write_fit_json(path: str | os.PathLike[str], result: FitResult) -> None:
@@ -125,6 +133,7 @@ def result_table(result: FitResult) -> str:
         *_free_rows(result),
         ("determined", f"{result.determined} of {len(result.singular_values)} directions"),
         ("nearest", _nearest(result)),
+        *([("glass", _probable(result))] if result.probabilities else []),
         ("residual", f"{result.rms_residual:.3g} rms"),
         *([("left out", f"{_count(result.masked, 'pixel')} by the mask")] if result.masked else []),
     ]
@@ -183,6 +192,14 @@ def _nearest(result: FitResult) -> str:
         f"{name} {distance:.{0 if distance >= 100 else 2}f} σ"
         for name, distance in result.nearest_glasses[:3]
     )
+
+
+def _probable(result: FitResult) -> str:
+    """The catalogue glasses that it may be, with their probabilities."""
+    names = [name for name, _ in result.nearest_glasses]
+    each = zip(names, result.probabilities, strict=False)
+    shown = [f"{name} {p:.3f}" for name, p in each if p >= LEAST_PROBABILITY]
+    return ", ".join([*shown[:3], f"none of the table {result.other_probability:.3f}"])
 
 
 # The fit as a page of plots.
