@@ -16,6 +16,7 @@ from diffdisp.fitting import (
     COLOR_WAVELENGTHS,
     Coefficients,
     FitResult,
+    StopFit,
     Unknowns,
     _covariance,
     _in_order,
@@ -674,6 +675,59 @@ def test_an_exception_in_progress_ends_the_fit(visible):
 
     with pytest.raises(StopError):
         fit(bench(SILICA), visible, progress=stop)
+
+
+def stopped_at(calls: int, error: type[BaseException]) -> Callable[[int, float, float], None]:
+    """A `progress` that raises when it is called so often."""
+    left = [calls]
+
+    def progress(step: int, rms: float, n_d: float) -> None:
+        left[0] -= 1
+        if not left[0]:
+            raise error
+
+    return progress
+
+
+@pytest.mark.parametrize("error", [StopFit, KeyboardInterrupt])
+def test_a_fit_that_is_stopped_returns_the_best_so_far(visible, visible_fit, error):
+    told: list[float] = []
+    fit(bench(SILICA), visible, progress=lambda step, rms, n_d: told.append(rms))
+    for calls in (1, len(told)):
+        result = fit(bench(SILICA), visible, progress=stopped_at(calls, error))
+        assert result.stopped
+        assert not result.converged
+        where = "the coarse picture" if calls == 1 else "the last level"
+        assert result.message.startswith("stopped in step ")
+        assert result.message.endswith(f" of {where}")
+        # Of the point that progress was told of last, or of a better one of another start.
+        assert result.rms_residual <= told[calls - 1]
+        assert result.picture.shape == visible.radiance.shape
+        assert np.isfinite(result.n_d_std)
+    assert abs(result.n_d - float(BK7.n_d)) < 1e-4  # as in `test_progress_is_told`
+    assert not visible_fit.stopped
+
+
+def test_a_fit_that_is_stopped_on_blocks_shows_them():
+    target = own_target(bench(BK7), Film(70, 70, VISIBLE.wavelengths))
+    result = fit(bench(SILICA), target, progress=stopped_at(2, StopFit))
+    assert result.message.endswith(" of the coarse picture")
+    assert result.picture.shape == (70, 70, 8)
+    # Blocks of 3 pixels, and the last one continued to the border.
+    last = np.broadcast_to(result.picture[3, 66], (3, 4, 8))
+    np.testing.assert_array_equal(result.picture[3:6, 66:70], last)
+    # Nearly the target: within its tiles, away from their edges, it is.
+    assert np.median(np.abs(result.picture - target.radiance)) < 0.05
+    assert "The last level used" not in result.summary
+
+
+def test_a_fit_without_a_point_has_nothing_to_return(visible, monkeypatch):
+    def interrupted(*_args: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("diffdisp.fitting._starts", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        fit(bench(SILICA), visible)
 
 
 def test_precision_is_double_and_the_switch_stays(visible, visible_fit):

@@ -743,6 +743,36 @@ def test_fit_that_does_not_converge(scene, target, out, capsys, fitted):
     assert {file.name for file in out.iterdir()} == {"fit.json", "report.png"}
 
 
+def test_ctrl_c_keeps_the_fit_so_far(scene, target, out, capsys, monkeypatch):
+    whole = fitting.fit
+
+    def interrupted(*args, progress, **options):
+        def tell(step, residual, n_d):
+            progress(step, residual, n_d)
+            raise KeyboardInterrupt
+
+        return whole(*args, progress=tell, **options)
+
+    monkeypatch.setattr("diffdisp.fitting.fit", interrupted)
+    assert main(["fit", scene, target, "-o", str(out / "fit")]) == 130
+    told = capsys.readouterr()
+    assert told.err == f"diffdisp: interrupted: {out / 'fit'} holds the fit so far\n"
+    assert "message    stopped in step 1 of the coarse picture" in told.out
+    written = json.loads((out / "fit" / "fit.json").read_text(encoding="utf-8"))
+    assert (written["converged"], written["stopped"]) == (False, True)
+    assert (out / "fit" / "report.png").is_file()
+
+
+def test_ctrl_c_before_a_fit_has_a_point(scene, target, out, capsys, monkeypatch):
+    def interrupted(*args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("diffdisp.fitting._starts", interrupted)
+    assert main(["fit", scene, target, "-o", str(out / "fit")]) == 130
+    assert capsys.readouterr() == ("", "diffdisp: interrupted, nothing written\n")
+    assert list(out.iterdir()) == []
+
+
 # The process.
 
 

@@ -23,6 +23,7 @@ KEYS = {
     *("n_d_std", "V_d", "V_d_std", "P_gF", "wavelength", "n", "n_std", "singular_values"),
     *("determined", "summary", "rms_residual", "nearest_glasses"),
     *("object", "prior", "P_gF_std", "free", "left_out", "loss", "other_glass_probability"),
+    "stopped",
 }
 LEFT_OUT = ("masked_pixels", "clipped_values", "outlying_values")
 

@@ -164,7 +164,8 @@ _BANDS_HELP = "nm; equal bands, seen at their middles, as 400:700:16 (default: c
 def _add_fit(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Recover B and C of a glass ball from a picture. The scene says where everything is and "
-        "which glass to start from. Exit status 3: it did not converge; the files are written."
+        "which glass to start from. Exit status 3: it did not converge; the files are written. "
+        "Ctrl-C writes the best point so far; the exit status is 130 then."
     )
     parser.set_defaults(run=_fit)
     add = parser.add_argument
@@ -413,6 +414,8 @@ def _fit(options: argparse.Namespace) -> int:
     write_report(folder / "report.png", result, target)
     write_fit_json(folder / "fit.json", result)
     print(result_table(result))
+    if result.stopped:
+        return _complain(f"interrupted: {folder} holds the fit so far", INTERRUPTED)
     return DONE if result.converged else NOT_CONVERGED
 
 

@@ -138,6 +138,14 @@ COLOR_WAVELENGTHS = np.arange(430, 681, 10) / 1e3
 """Where a fit to a colour picture reports n(λ), µm: beyond, sRGB sees almost nothing."""
 
 
+COARSE, FEW, LAST = "the coarse picture", "the whole picture at few samples", "the last level"
+"""What the levels of a fit are called."""
+
+
+class StopFit(Exception):
+    """Raised by `progress`, ends a fit, which then returns the best point so far."""
+
+
 class FreeValue(NamedTuple):
     """What a fit found of a number that was free beside B and C.
 
@@ -194,6 +202,8 @@ class FitResult:
         outliers: how many values the robust loss left out at the end.
         probabilities: of `nearest_glasses`, that the ball is made of each.
         other_probability: that it is of none of the table.
+        stopped: whether it was told to stop; all else is then of the best point so far, and
+            `picture` is 0 where nothing had been rendered.
     """
 
     scene: Scene
@@ -232,6 +242,7 @@ class FitResult:
     outliers: int = 0
     probabilities: tuple[float, ...] = ()
     other_probability: float = float("nan")
+    stopped: bool = False
 
     @property
     def masked(self) -> int:
@@ -387,6 +398,7 @@ class Problem(NamedTuple):
         free: what else is.
         loss: one of `LOSSES`.
         progress: called with the step, the root mean square residual and n_d.
+        kept: the best point so far, and its level, once there is one; it is kept up to date.
     """
 
     scene: Scene
@@ -400,6 +412,7 @@ class Problem(NamedTuple):
     free: Free
     loss: str
     progress: Callable[[int, float, float], None]
+    kept: "list[tuple[Level, Descent]]"
 
 
 class Part(NamedTuple):
@@ -431,6 +444,8 @@ class Level(NamedTuple):
     """One resolution of the problem.
 
     Args:
+        name: what it is called.
+        size: of a block, pixels along each side.
         blocks: (blocks,) numbers of those that count, row by row over the film.
         parts: what renders them; the shares of each block's parts sum to 1.
         target: (blocks, channels).
@@ -440,6 +455,8 @@ class Level(NamedTuple):
         robust: the loss; None for squares.
     """
 
+    name: str
+    size: int
     blocks: np.ndarray
     parts: tuple[Part, ...]
     target: np.ndarray
@@ -485,10 +502,13 @@ def fit(
         loss: "squares"; or "robust", by which values far off what most others show, in units of
             their spread, pull no stronger (Huber) on the way and not at all (Tukey) in the end.
             Errors are then those of the M-estimate.
-        progress: called with the step, the root mean square residual and n_d.
+        progress: called with the step, the root mean square residual and n_d. It may raise
+            `StopFit`.
 
     Returns:
-        The glass, its errors and how the fit ended; look at `converged`.
+        The glass, its errors and how the fit ended; look at `converged`. After `StopFit`, or
+        Ctrl-C once there is a first point, those of the best point so far: `stopped` is true then
+        and `converged` false, and `message` says at which level.
 
     Raises:
         ValueError: no such glass ball, or several and no name; a start with a pole in the band or
@@ -591,6 +611,7 @@ def _problem(
         others,
         loss,
         progress,
+        [],
     )
 
 
@@ -639,7 +660,13 @@ def _by_C(C: Array) -> np.ndarray:
 
 
 def _level(
-    problem: Problem, size: int, samples: int, depth: int, seed: int, split: int = 1
+    problem: Problem,
+    name: str,
+    size: int,
+    samples: int,
+    depth: int,
+    seed: int,
+    split: int = 1,
 ) -> Level:
     """The problem in blocks of `size` pixels, each with `samples` · `split`² samples.
 
@@ -655,13 +682,13 @@ def _level(
     share = means(problem.used)
     blocks = np.flatnonzero(_counted(share[:, 0]))
     if not len(blocks):
-        return _level(problem, 1, samples, depth, seed, split)
+        return _level(problem, name, 1, samples, depth, seed, split)
     share = share[blocks]
     part = _part(problem, size, samples, depth, blocks, np.arange(len(blocks)), split)
     target = means(problem.target)[blocks] / share
     clipped = _clipped(problem, means, blocks, share)
     robust = Robust("huber", problem.free.brightest) if problem.loss == "robust" else None
-    return Level(blocks, (part,), target, share, seed, clipped, robust)
+    return Level(name, size, blocks, (part,), target, share, seed, clipped, robust)
 
 
 def _clipped(
@@ -1037,6 +1064,14 @@ def _descend(
         along: where slopes along the scene's numbers are taken; by default on the level itself.
     """
 
+    def keep() -> None:
+        spread = level.robust.spread if level.robust else 0.0
+        now = Descent(at, lin, steps, False, spread)
+        # Several starts compete on the coarse picture, and there only.
+        others = [end for at_level, end in problem.kept if at_level.name == level.name == COARSE]
+        if all(lin.cost <= end.lin.cost for end in others):
+            problem.kept[:] = [(level, now)]
+
     def look(at: Point, known: Columns | None = None) -> Linearised:
         if known is None and along is not None:
             known = _linearise(problem, along, at, cutoff).columns
@@ -1048,6 +1083,7 @@ def _descend(
     level, lin = _rescaled(level, look(at), brightest)
     damping, converged = 0.0, False
     steps, anchor = 1, at.z
+    keep()
     while steps < most and not converged:
         problem.progress(steps, lin.rms, _n_d(unknowns, at.z))
         # Whether a minimum is near, a step tells that nothing holds back.
@@ -1075,6 +1111,7 @@ def _descend(
         elif has <= had or rough:
             at, damping = new, damping / 10 if damping > 1e-2 else 0.0
             level, lin = _rescaled(level, tried, brightest)
+            keep()
         else:
             damping = max(10 * damping, 1.0)
     return Descent(at, lin, steps, converged, level.robust.spread if level.robust else 0.0)
@@ -1320,21 +1357,37 @@ def _variants(unknowns: Unknowns, waves: np.ndarray) -> list[np.ndarray]:
 
 
 def _fit(problem: Problem, target: Picture, prior: str, noise: float | None) -> FitResult:
+    """The result of a search, or of as much of it as there was time for."""
+    stopped = False
+    try:
+        level, best = _search(problem, target)
+    except (KeyboardInterrupt, StopFit):
+        if not problem.kept:
+            raise
+        ((level, best),), stopped = problem.kept, True
+    said = {"samples": target.samples, "depth": target.depth, "seed": target.seed}
+    if level.name != LAST:
+        said = {}
+    own = ", ".join(f"{name} {value}" for name, value in said.items() if value is not None)
+    return _result(problem, best, level, prior, noise, own, stopped)
+
+
+def _search(problem: Problem, target: Picture) -> "tuple[Level, Descent]":
     """Coarse to fine: the best of several starts, then the whole picture, then its final form."""
     film, depth, seed = problem.film, target.depth or 50, target.seed or 0
     coarse = max(1, -(-max(film.width, film.height) // COARSE_PIXELS))
-    level = _level(problem, coarse, FEW_SAMPLES, depth, seed)
+    level = _level(problem, COARSE, coarse, FEW_SAMPLES, depth, seed)
     ends = [_descend(problem, level, at, CUTOFF, 8, 1.0) for at in _starts(problem, level, 3)]
     best = min(ends, key=lambda end: end.lin.cost)
     along = None
     if target.samples is None:
-        level = _level(problem, 1, FEW_SAMPLES, depth, seed)
-        many = _level(problem, 1, FEW_SAMPLES, depth, seed, SPLITS[0])
+        level = _level(problem, FEW, 1, FEW_SAMPLES, depth, seed)
+        many = _level(problem, LAST, 1, FEW_SAMPLES, depth, seed, SPLITS[0])
         best = _descend(problem, level, best.at, CUTOFF, 20, 1.0)
         level, at = _refined(problem, best, many, depth)
         along = many if problem.free.parameters else None
     else:
-        level, at = _level(problem, 1, target.samples, depth, seed), best.at
+        level, at = _level(problem, LAST, 1, target.samples, depth, seed), best.at
     best = _descend(problem, level, at, CUTOFF, 30, LINEAR_STEP, along)
     if problem.free.parameters and best.converged:
         polished = _descend(problem, level, best.at, CUTOFF, POLISH, SMALL_STEP, along)
@@ -1348,9 +1401,7 @@ def _fit(problem: Problem, target: Picture, prior: str, noise: float | None) -> 
         # So clean a picture shows the light of the paths that were ended early.
         exact = _descend(problem, level, best.at, 0.0, 30, SMALL_STEP, along)
         best = exact._replace(steps=best.steps + exact.steps)
-    said = {"samples": target.samples, "depth": target.depth, "seed": target.seed}
-    own = ", ".join(f"{name} {value}" for name, value in said.items() if value is not None)
-    return _result(problem, best, level, prior, noise, own)
+    return level, best
 
 
 def _result(
@@ -1360,6 +1411,7 @@ def _result(
     prior: str,
     given: float | None,
     own: str,
+    stopped: bool,
 ) -> FitResult:
     """The result in the words of the glass, with its errors."""
     unknowns, lin, film, free = problem.unknowns, end.lin, problem.film, problem.free
@@ -1390,6 +1442,8 @@ def _result(
     determined = int(np.sum(singular > 1 / DETERMINED))
     glass = Sellmeier(B, C, object_glass(problem.scene, problem.number).validity)
     converged, message = _verdict(end)
+    if stopped:
+        converged, message = False, f"stopped in step {end.steps} of {level.name}"
     left, within = lin.eliminated(), meat[free.total :, free.total :]
     named, other = _named(unknowns, end.at.z, left, within)
     scene = _with_others(problem, end.at.others)
@@ -1430,7 +1484,7 @@ def _result(
         prior=prior,
         noise=given,
         samples=tuple(part.plan.samples * part.split**2 for part in level.parts),
-        picture=_whole_picture(problem, level, end),
+        picture=_whole_picture(problem, level, end, stopped),
         free=tuple(_free_values(free, scene, end.at.others, np.sqrt(np.diag(whole)))),
         used=None if problem.used.all() else problem.used,
         clipped=clipped,
@@ -1438,21 +1492,31 @@ def _result(
         outliers=outliers,
         probabilities=tuple(probability for _, _, probability in named[:5]),
         other_probability=other,
+        stopped=stopped,
     )
 
 
-def _whole_picture(problem: Problem, level: Level, end: Descent) -> np.ndarray:
-    """The render (height, width, channels) where a fit ended, of what a mask left out too."""
-    pixels = np.zeros((problem.used.size, problem.film.channels))
-    pixels[level.blocks] = end.lin.picture
+def _whole_picture(problem: Problem, level: Level, end: Descent, stopped: bool) -> np.ndarray:
+    """The render (height, width, channels) where a fit ended; of what a mask left out too.
+
+    Who stops a fit does not want to wait for that.
+    """
+    size, film = level.size, problem.film
+    width, height = film.width // size, film.height // size
+    blocks = np.zeros((height * width, film.channels))
+    blocks[level.blocks] = end.lin.picture
+    if size > 1:
+        wide = blocks.reshape(height, width, -1).repeat(size, axis=0).repeat(size, axis=1)
+        beyond = (0, film.height - height * size), (0, film.width - width * size), (0, 0)
+        return np.pad(wide, beyond, mode="edge")
     rest = np.flatnonzero(~problem.used)
-    if len(rest):
+    if len(rest) and not stopped:
         like, (gains, black) = level.parts[0], problem.free.exposure(end.at.others)
         own = np.arange(len(rest))
         part = _part(problem, 1, like.plan.samples, like.plan.depth, rest, own, like.split)
         traced = _trace(problem, part, end.at, level.seed, CUTOFF, False)
-        pixels[rest] = traced[:, 0] * gains + black
-    return pixels.reshape(problem.target.shape)
+        blocks[rest] = traced[:, 0] * gains + black
+    return blocks.reshape(problem.target.shape)
 
 
 def _with_others(problem: Problem, others: np.ndarray) -> Scene:

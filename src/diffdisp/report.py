@@ -52,6 +52,7 @@ def fit_json(result: FitResult) -> dict[str, Any]:
         "prior": result.prior,
         "converged": bool(result.converged),
         "message": result.message,
+        "stopped": bool(result.stopped),
         "steps": int(result.steps),
         "B": _plain(result.B),
         "C": _plain(result.C),
