@@ -174,3 +174,14 @@ def test_a_robust_step_and_its_spread_are_those_of_an_m_estimate(robust):
     np.testing.assert_allclose(meat, spread, rtol=1e-9, atol=1e-11)
     np.testing.assert_allclose(lin.cost, np.sum(height.ravel() * example.residual**2), rtol=1e-12)
     np.testing.assert_array_equal(lin.score, example.picture - example.target)
+
+
+def test_pulls_are_the_slope_of_the_cost(example):
+    lin = example.lin
+    np.testing.assert_allclose(lin.pulled(lin.pulls), lin.q, rtol=1e-9, atol=1e-12)
+    # One value alone, weighed.
+    one = np.zeros((BLOCKS, CHANNELS))
+    one[3, 1] = lin.pulls[3, 1]
+    row = np.ravel_multi_index((3, 1), one.shape)
+    expected = example.jacobian[row] * example.residual[row]
+    np.testing.assert_allclose(lin.r.T @ lin.pulled(one), expected, rtol=1e-9, atol=1e-12)

@@ -714,17 +714,17 @@ def test_fit(scene, target, out, capsys, fitted):
     assert fitted["noise"] is None
     assert fitted["start"] is None
     assert fitted["mask"] is None
-    assert fitted["loss"] == "squares"
+    assert (fitted["loss"], fitted["check"]) == ("squares", None)
 
 
 def test_fit_options(scene, target, out, fitted):
     options = ["--object", "ball", "--prior", "fixed-c3", "--noise", "1e-3", "--start", "f2"]
-    options += ["--free", "ball.center", "--free", "gain", "--loss", "robust"]
+    options += ["--free", "ball.center", "--free", "gain", "--loss", "robust", "--check"]
     assert main(["fit", scene, target, "-o", str(out), *options]) == 0
     assert (fitted["object_name"], fitted["prior"], fitted["noise"]) == ("ball", "fixed-c3", 1e-3)
     assert fitted["start"].name == "F2"
     assert fitted["free"] == ["ball.center", "gain"]
-    assert fitted["loss"] == "robust"
+    assert (fitted["loss"], fitted["check"]) == ("robust", "resample")
 
 
 def test_fit_with_a_mask(scene, target, tmp_path, out, fitted):

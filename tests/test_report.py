@@ -7,7 +7,7 @@ import pytest
 from fake_fit import BANDS, blurred_ring, fake_result, fake_target
 
 from diffdisp.dispersion import Sellmeier
-from diffdisp.fitting import FreeValue
+from diffdisp.fitting import FreeValue, Resampled
 from diffdisp.glasses import named_glass
 from diffdisp.image import Picture
 from diffdisp.report import (
@@ -23,7 +23,7 @@ KEYS = {
     *("n_d_std", "V_d", "V_d_std", "P_gF", "wavelength", "n", "n_std", "singular_values"),
     *("determined", "summary", "rms_residual", "nearest_glasses"),
     *("object", "prior", "P_gF_std", "free", "left_out", "loss", "other_glass_probability"),
-    "stopped",
+    *("stopped", "check"),
 }
 LEFT_OUT = ("masked_pixels", "clipped_values", "outlying_values")
 
@@ -85,6 +85,15 @@ def test_how_likely_the_nearest_glasses_are(tmp_path):
     write_report(tmp_path / "a.png", result, fake_target())
     write_report(tmp_path / "b.png", fake_result(), fake_target())
     assert (tmp_path / "a.png").read_bytes() != (tmp_path / "b.png").read_bytes()
+
+
+def test_a_check_is_told():
+    assert fit_json(fake_result())["check"] is None
+    assert "check" not in result_table(fake_result())
+    result = fake_result(check=Resampled(51, 4e-6, 1.3))
+    assert fit_json(result)["check"] == {"repeats": 51, "n_d_std": 4e-6, "ratio": 1.3}
+    # A standard deviation of 51 is known to a tenth.
+    assert "check      resampled n_d spreads 1.30 ± 0.13 times its error\n" in result_table(result)
 
 
 def test_json_has_null_for_what_is_not_finite(tmp_path):

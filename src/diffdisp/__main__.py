@@ -176,6 +176,7 @@ def _add_fit(parser: argparse.ArgumentParser) -> None:
     add("--free", action="append", default=[], metavar="NAME", help=_FREE_HELP)
     add("--prior", choices=PRIORS, default="none", help="what is known beforehand (default none)")
     add("--loss", choices=LOSSES, default="squares", help="robust: outliers do not count")
+    add("--check", action="store_true", help="of n_d's error, by resampling the residual")
     add("--noise", type=_noise, metavar="SIGMA", help="of the radiance (default: estimated)")
     add("--start", metavar="GLASS", help="glass to start from (default: that of the scene)")
     add(
@@ -408,6 +409,7 @@ def _fit(options: argparse.Namespace) -> int:
             start=start,
             mask=mask,
             loss=options.loss,
+            check="resample" if options.check else None,
             progress=progress,
         )
     folder.mkdir(parents=True, exist_ok=True)

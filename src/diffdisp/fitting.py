@@ -138,12 +138,34 @@ COLOR_WAVELENGTHS = np.arange(430, 681, 10) / 1e3
 """Where a fit to a colour picture reports n(λ), µm: beyond, sRGB sees almost nothing."""
 
 
+CHECKS = ("resample",)
+
+REPEATS = 50
+"""Of a check by resampling: its spread is then known to 10 %, in some ten seconds."""
+
+TOGETHER = 3
+"""Pixels along each side of the squares whose misfits a check turns together."""
+
 COARSE, FEW, LAST = "the coarse picture", "the whole picture at few samples", "the last level"
 """What the levels of a fit are called."""
 
 
 class StopFit(Exception):
     """Raised by `progress`, ends a fit, which then returns the best point so far."""
+
+
+class Resampled(NamedTuple):
+    """What a check by resampling found.
+
+    Args:
+        repeats: how many.
+        n_d_std: standard deviation of their n_d.
+        ratio: of that to the one reported.
+    """
+
+    repeats: int
+    n_d_std: float
+    ratio: float
 
 
 class FreeValue(NamedTuple):
@@ -204,6 +226,7 @@ class FitResult:
         other_probability: that it is of none of the table.
         stopped: whether it was told to stop; all else is then of the best point so far, and
             `picture` is 0 where nothing had been rendered.
+        check: of the errors, where one was asked for and something depends on the glass.
     """
 
     scene: Scene
@@ -243,6 +266,7 @@ class FitResult:
     probabilities: tuple[float, ...] = ()
     other_probability: float = float("nan")
     stopped: bool = False
+    check: Resampled | None = None
 
     @property
     def masked(self) -> int:
@@ -477,6 +501,7 @@ def fit(
     start: Sellmeier | None = None,
     mask: np.ndarray | None = None,
     loss: str = "squares",
+    check: str | None = None,
     progress: Callable[[int, float, float], None] | None = None,
 ) -> FitResult:
     """The Sellmeier coefficients of a glass ball from a picture of it, in float64.
@@ -502,6 +527,10 @@ def fit(
         loss: "squares"; or "robust", by which values far off what most others show, in units of
             their spread, pull no stronger (Huber) on the way and not at all (Tukey) in the end.
             Errors are then those of the M-estimate.
+        check: "resample": the last step is repeated with the misfits of squares of pixels turned
+            round at random, which shows whether the error reported of n_d is the spread that
+            noise of this kind gives it. It takes the picture as linear near the answer, and does
+            not know errors of the scene or of the render.
         progress: called with the step, the root mean square residual and n_d. It may raise
             `StopFit`.
 
@@ -520,6 +549,8 @@ def fit(
         raise ValueError(f"prior {prior!r}: allowed are {', '.join(PRIORS)}")
     if loss not in LOSSES:
         raise ValueError(f"loss {loss!r}: allowed are {', '.join(LOSSES)}")
+    if check is not None and check not in CHECKS:
+        raise ValueError(f"check {check!r}: allowed are {', '.join(CHECKS)}")
     if noise is not None and not (np.isfinite(noise) and noise > 0):
         raise ValueError(f"noise {noise}: must be a finite number above 0")
     number = _glass_object(scene, object_name)
@@ -530,7 +561,7 @@ def fit(
     target = replace(target, radiance=np.where(used[..., None], target.radiance, 0.0))
     with jax.enable_x64(True):
         problem = _problem(scene, number, target, used, free, prior, loss, progress or _silent)
-        return _fit(problem, target, prior, noise)
+        return _fit(problem, target, prior, noise, check)
 
 
 def _used(target: Picture, mask: np.ndarray | None) -> np.ndarray:
@@ -1034,6 +1065,7 @@ class Descent(NamedTuple):
         steps: pictures traced.
         converged: whether a next step would change nothing that the picture can tell.
         spread: of misfits that are no outliers, where the loss is robust; else 0.
+        anchor: where z stays if the picture says nothing.
     """
 
     at: Point
@@ -1041,6 +1073,7 @@ class Descent(NamedTuple):
     steps: int
     converged: bool
     spread: float
+    anchor: np.ndarray
 
 
 def _descend(
@@ -1066,7 +1099,7 @@ def _descend(
 
     def keep() -> None:
         spread = level.robust.spread if level.robust else 0.0
-        now = Descent(at, lin, steps, False, spread)
+        now = Descent(at, lin, steps, False, spread, anchor)
         # Several starts compete on the coarse picture, and there only.
         others = [end for at_level, end in problem.kept if at_level.name == level.name == COARSE]
         if all(lin.cost <= end.lin.cost for end in others):
@@ -1114,7 +1147,8 @@ def _descend(
             keep()
         else:
             damping = max(10 * damping, 1.0)
-    return Descent(at, lin, steps, converged, level.robust.spread if level.robust else 0.0)
+    spread = level.robust.spread if level.robust else 0.0
+    return Descent(at, lin, steps, converged, spread, anchor)
 
 
 def _largest(unknowns: Unknowns, at: Point, new: Point) -> float:
@@ -1356,7 +1390,9 @@ def _variants(unknowns: Unknowns, waves: np.ndarray) -> list[np.ndarray]:
     return found
 
 
-def _fit(problem: Problem, target: Picture, prior: str, noise: float | None) -> FitResult:
+def _fit(
+    problem: Problem, target: Picture, prior: str, noise: float | None, check: str | None
+) -> FitResult:
     """The result of a search, or of as much of it as there was time for."""
     stopped = False
     try:
@@ -1369,7 +1405,53 @@ def _fit(problem: Problem, target: Picture, prior: str, noise: float | None) -> 
     if level.name != LAST:
         said = {}
     own = ", ".join(f"{name} {value}" for name, value in said.items() if value is not None)
-    return _result(problem, best, level, prior, noise, own, stopped)
+    result = _result(problem, best, level, prior, noise, own, stopped)
+    if check is None or stopped or best.lin.seen == 0:
+        return result
+    return replace(result, check=_resampled(problem, level, best, noise, result.n_d_std))
+
+
+def _resampled(
+    problem: Problem, level: Level, end: Descent, given: float | None, reported: float
+) -> Resampled:
+    """The spread of n_d when the last step is repeated with other noise.
+
+    The misfits of the fit, their signs turned at random: so their sizes stay where they are, as in
+    the sandwich. But those of all channels of a square of pixels are turned together: where
+    neighbours or channels err alike, which the sandwich does not know, the spread is larger than
+    the error reported. A clean picture shows no noise, and gets as much as its errors refer to.
+
+    Source:
+        Liu, Ann. Stat. 16 (1988) 1696, the wild bootstrap; Cameron, Gelbach and Miller, Rev. Econ.
+        Stat. 90 (2008) 414, that of clusters.
+    """
+    lin, generator = end.lin, np.random.default_rng(0)
+    brightest = float(np.max(np.abs(problem.target)))
+    meat, _, _ = _noise(lin, given, brightest)
+    width = problem.film.width
+    y, x = np.divmod(level.blocks, width)
+    square = (y // TOGETHER) * (width // TOGETHER + 1) + x // TOGETHER
+    clean = lin.noise < CLEAN * brightest
+    held, anything = (_root(part) for part in (lin.held, meat))
+    found = []
+    for _ in range(REPEATS):
+        normal = generator.normal(size=len(lin.q))
+        if clean:
+            other = anything @ normal
+        else:
+            signs = generator.choice([-1.0, 1.0], np.max(square) + 1)[square]
+            other = lin.pulled(lin.pulls * signs[:, None]) + held @ normal
+        noisy = lin._replace(q=lin.q + other)
+        at, _ = _next_point(problem.unknowns, end.at, end.anchor, noisy, 0.0)
+        found.append(_n_d(problem.unknowns, at.z))
+    spread = float(np.std(found, ddof=1))
+    return Resampled(REPEATS, spread, spread / reported)
+
+
+def _root(covariance: np.ndarray) -> np.ndarray:
+    """A matrix that turns numbers of variance 1 into such with a covariance."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 def _search(problem: Problem, target: Picture) -> "tuple[Level, Descent]":

@@ -59,6 +59,7 @@ class Linearised(NamedTuple):
         columns: J.
         picture: the render.
         score: picture minus target; of clipped values what they tell of it.
+        pulls: what each value adds to the slope of the cost: Jᵀ pulls = Rᵀ q, J without weights.
     """
 
     r: Float[np.ndarray, "total total"]
@@ -74,6 +75,7 @@ class Linearised(NamedTuple):
     columns: Columns
     picture: Float[np.ndarray, "blocks channels"]
     score: Float[np.ndarray, "blocks channels"]
+    pulls: Float[np.ndarray, "blocks channels"]
 
     @property
     def weight(self) -> np.ndarray:
@@ -87,6 +89,13 @@ class Linearised(NamedTuple):
         rms = self.rms * np.sqrt(cost / self.cost) if self.cost > 0 else 0.0
         picture = self.picture + self.columns.along(change)
         return self._replace(q=q, cost=cost, rms=float(rms), picture=picture)
+
+    def pulled(self, pulls: np.ndarray) -> np.ndarray:
+        """What q (total,) would be if these were the pulls (blocks, channels)."""
+        slope = np.zeros(self.columns.total)
+        each = np.einsum("cbk,bc->ck", self.columns.values, pulls)
+        np.add.at(slope, self.columns.unknown, each)
+        return np.linalg.solve(self.r.T, slope)
 
     def eliminated(self, damping: float = 0.0) -> "Eliminated":
         """What is left for the index when the others take their best values.
@@ -213,6 +222,7 @@ def linearise(
         columns,
         picture,
         told.score,
+        root * residual,
     )
 
 

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from diffdisp.color import encode_srgb
 from diffdisp.dispersion import Sellmeier
-from diffdisp.fitting import FitResult
+from diffdisp.fitting import FitResult, Resampled
 from diffdisp.glasses import named_glass
 from diffdisp.image import Picture, linear_rgb, replacing
 
@@ -80,11 +80,16 @@ def fit_json(result: FitResult) -> dict[str, Any]:
         },
         "nearest_glasses": list(_nearest_entries(result)),
         "other_glass_probability": _plain(result.other_probability),
+        "check": None if result.check is None else _plain_check(result.check),
         "free": [
             {"name": name, "value": _plain(value), "std": _plain(std)}
             for name, value, std in result.free
         ],
     }
+
+
+def _plain_check(check: Resampled) -> dict[str, Any]:
+    return {name: _plain(value) for name, value in check._asdict().items()}
 
 
 def _nearest_entries(result: FitResult) -> Iterator[dict[str, Any]]:
@@ -136,6 +141,7 @@ def result_table(result: FitResult) -> str:
         ("nearest", _nearest(result)),
         *([("glass", _probable(result))] if result.probabilities else []),
         ("residual", f"{result.rms_residual:.3g} rms"),
+        *([("check", _checked(result.check))] if result.check else []),
         *([("left out", f"{_count(result.masked, 'pixel')} by the mask")] if result.masked else []),
     ]
     width = max([11, *(len(value.name) + 2 for value in result.free)])
@@ -193,6 +199,12 @@ def _nearest(result: FitResult) -> str:
         f"{name} {distance:.{0 if distance >= 100 else 2}f} σ"
         for name, distance in result.nearest_glasses[:3]
     )
+
+
+def _checked(check: Resampled) -> str:
+    """What resampling found."""
+    margin = check.ratio / math.sqrt(2 * (check.repeats - 1))
+    return f"resampled n_d spreads {check.ratio:.2f} ± {margin:.2f} times its error"
 
 
 def _probable(result: FitResult) -> str:
