@@ -743,6 +743,7 @@ def test_a_fit_that_is_stopped_returns_the_best_so_far(visible, visible_fit, err
         assert not result.converged
         where = "the coarse picture" if calls == 1 else "the last level"
         assert result.message.startswith("stopped in step ")
+        assert "The fit was stopped: its answer may lie many of these errors away" in result.summary
         assert result.message.endswith(f" of {where}")
         # Of the point that progress was told of last, or of a better one of another start.
         assert result.rms_residual <= told[calls - 1]
@@ -750,6 +751,7 @@ def test_a_fit_that_is_stopped_returns_the_best_so_far(visible, visible_fit, err
         assert np.isfinite(result.n_d_std)
     assert abs(result.n_d - float(BK7.n_d)) < 1e-4  # as in `test_progress_is_told`
     assert not visible_fit.stopped
+    assert "stopped" not in visible_fit.summary
 
 
 def test_a_fit_that_is_stopped_on_blocks_shows_them():

@@ -109,6 +109,9 @@ UNDERSTATED = (
 """What has to be said of errors beside free numbers of the scene: on the bench at a noise of 1 %,
 with place and radius of the ball free, n_d was up to 5.4 reported standard deviations off."""
 
+UNFINISHED = " The fit was stopped: its answer may lie many of these errors away."
+"""What has to be said of errors that are those about a point, which is no minimum yet."""
+
 POLISH = 6
 """Steps more, at most, where more than the glass is free: a scene's numbers move the picture less
 nearly in straight lines."""
@@ -1560,7 +1563,8 @@ def _result(
         summary=_summary(waves, n_std, determined, len(singular), source, prior, own)
         + _clipped_words(clipped, problem.ceiling)
         + _outlier_words(outliers)
-        + (UNDERSTATED if free.parameters else ""),
+        + (UNDERSTATED if free.parameters else "")
+        + (UNFINISHED if stopped else ""),
         rms_residual=lin.rms,
         nearest_glasses=tuple((name, distance) for name, distance, _ in named[:5]),
         prior=prior,
