@@ -16,13 +16,16 @@ from diffdisp.fitting import (
     COLOR_WAVELENGTHS,
     Coefficients,
     FitResult,
+    StopFit,
     Unknowns,
+    _counted,
     _covariance,
     _in_order,
+    _probabilities,
     fit,
 )
 from diffdisp.glasses import glass_table, named_glass
-from diffdisp.image import Picture, read_picture
+from diffdisp.image import Picture, read_picture, write_picture
 from diffdisp.linearised import Columns, linearise
 from diffdisp.rendering import render
 from diffdisp.scene import Scene
@@ -295,6 +298,8 @@ def two_balls(glass: Sellmeier = BK7) -> Scene:
     ("scene", "options", "words"),
     [
         (bench(), {"prior": "guess"}, "prior 'guess': allowed are none, catalogue, fixed-c3"),
+        (bench(), {"loss": "cubes"}, "loss 'cubes': allowed are squares, robust"),
+        (bench(), {"check": "twice"}, "check 'twice': allowed are resample"),
         (bench(), {"noise": 0.0}, "noise 0.0: must be a finite number above 0"),
         (bench(), {"noise": -1e-3}, "noise -0.001: must be a finite number above 0"),
         (bench(), {"noise": float("nan")}, "noise nan: must be a finite number above 0"),
@@ -359,6 +364,187 @@ def test_noise_alone_is_no_fit(visible):
     result = fit(bench(SILICA), Picture(radiance, visible.wavelengths, SAMPLES, DEPTH, 0))
     assert not result.converged
     assert result.message
+
+
+# --- clipped values
+
+
+def test_an_overexposed_picture(tmp_path):
+    clean = own_target(bench(BK7), Film(24, 24))
+    exposed = with_noise(replace(clean, radiance=1.5 * clean.radiance), 1)
+    write_picture(tmp_path / "a.png", exposed)
+    target = replace(read_picture(tmp_path / "a.png"), samples=SAMPLES, depth=DEPTH, seed=0)
+    result = fit(bench(SILICA), target, free=("gain",))
+    assert result.converged, result.message
+    assert result.clipped == np.sum(exposed.radiance >= target.ceiling) > 500
+    assert f" {result.clipped} values of the target are clipped" in result.summary
+    assert abs(result.n_d - float(BK7.n_d)) < 3 * result.n_d_std < 6e-4
+    assert abs(result.V_d - float(BK7.V_d)) < 3 * result.V_d_std
+    for _, gain, std in result.free:  # 32 reported errors off where clipped values are believed
+        assert abs(gain - 1.5) < 4 * std < 0.01
+
+
+def test_what_is_just_as_bright_as_white_is_not_clipped_away(tmp_path, color):
+    # Bright tiles shine with radiance 1, the top code; a few pixels see nothing else.
+    write_picture(tmp_path / "a.png", color)
+    target = replace(read_picture(tmp_path / "a.png"), samples=SAMPLES, depth=DEPTH, seed=0)
+    result = fit(bench(SILICA), target, free=("gain",))
+    assert result.converged, result.message
+    assert result.clipped > 10
+    # Rounding to 8 bits is no independent noise, yet leaves errors of the reported size.
+    assert abs(result.n_d - float(BK7.n_d)) < 3 * result.n_d_std < 3e-4
+    for _, gain, _ in result.free:
+        assert abs(gain - 1) < 2e-3  # half a code at the top is 4.5e-3
+
+
+@pytest.mark.slow
+def test_a_png_of_another_renderer():
+    result = fit(load_scene(TARGETS / "ball_nbk7.toml"), read_picture(TARGETS / "ball_nbk7.png"))
+    truth = named_glass("N-BK7")
+    assert result.converged, result.message
+    assert result.clipped == 3023 + 3022 + 3024  # the tiles beside the ball
+    # What 8 bits of three channels leave open; and the errors are admitted.
+    assert abs(result.n_d - float(truth.n_d)) <= min(2e-4, 3 * result.n_d_std)
+    assert abs(result.V_d - float(truth.V_d)) <= min(1.0, 3 * result.V_d_std)
+    assert result.nearest_glasses[0][0] == "N-BK7"
+
+
+# --- outliers
+
+
+def test_spoiled_pixels(visible):
+    target = with_noise(visible, 0)
+    spoiled = np.random.default_rng(100).random((SIZE, SIZE)) < 0.02
+    target.radiance[spoiled] += 0.5
+    squares, robust = (fit(bench(SILICA), target, loss=loss) for loss in ("squares", "robust"))
+    assert (squares.outliers, robust.outliers) == (0, 8 * np.sum(spoiled))
+    assert robust.converged, robust.message
+    assert robust.loss == "robust"
+    assert abs(robust.n_d - float(BK7.n_d)) < 3 * robust.n_d_std
+    assert abs(robust.V_d - float(BK7.V_d)) < 3 * robust.V_d_std
+    # Nearly as well known as without spoiled pixels, and by squares far off.
+    assert robust.n_d_std < 1.2e-4
+    assert abs(squares.n_d - float(BK7.n_d)) > 10 * robust.n_d_std
+    assert f" {robust.outliers} values are outliers" in robust.summary
+
+
+def test_a_robust_loss_costs_little_without_outliers(visible):
+    target = with_noise(visible, 3)
+    squares, robust = (
+        fit(bench(SILICA), target, loss=loss, noise=NOISE) for loss in ("squares", "robust")
+    )
+    # 5 % of the information is 2.6 % of the error. The spread and the mean slope of the loss rest
+    # on the few hundred values that show most of the index: 5 % each.
+    assert 0.96 < robust.n_d_std / squares.n_d_std < 1.1
+    assert "given noise of 0.01" in robust.summary
+    assert abs(robust.n_d - squares.n_d) < robust.n_d_std
+    assert robust.outliers < 10  # normal noise is beyond 4.685 sigma once in 360 000
+
+
+def test_a_robust_loss_on_a_clean_picture(visible):
+    spoiled = replace(visible, radiance=visible.radiance.copy())
+    spoiled.radiance[9, 12] += 0.5
+    result = fit(bench(SILICA), spoiled, loss="robust")
+    assert result.converged, result.message
+    # The noise taken is 1e-5 at least, of which a linear step leaves little.
+    assert abs(result.n_d - float(BK7.n_d)) < 1e-6
+    assert result.outliers == 8
+    assert "the picture is clean" in result.summary
+
+
+# --- a mask
+
+
+def test_what_a_mask_leaves_out_is_not_seen(visible):
+    mask = np.ones((SIZE, SIZE), bool)
+    mask[:, : SIZE // 3] = False
+    results = []
+    for rubbish in (0.0, 9.0, np.nan):
+        radiance = with_noise(visible, 7).radiance
+        radiance[~mask] = rubbish
+        results.append(fit(bench(SILICA), replace(visible, radiance=radiance), mask=mask))
+    first = results[0]
+    assert first.converged, first.message
+    assert first.masked == SIZE * (SIZE // 3)
+    # Normal errors exceed 4 sigma once in 16 000.
+    assert abs(first.n_d - float(BK7.n_d)) < 4 * first.n_d_std
+    assert abs(first.V_d - float(BK7.V_d)) < 4 * first.V_d_std
+    # A standard deviation from 2640 values is known to 1.4 %; six polynomials are fitted.
+    assert abs(first.rms_residual / NOISE - 1) < 0.06
+    for other in results[1:]:
+        np.testing.assert_array_equal(other.n, first.n)
+        np.testing.assert_array_equal(other.covariance, first.covariance)
+    # The picture is whole, of the fitted glass: n is off by some 1e-4 in so noisy a picture.
+    assert first.picture.shape == visible.radiance.shape
+    assert np.max(np.abs(first.picture - visible.radiance)) < 0.05
+
+
+def test_what_two_halves_know_is_what_the_whole_knows(visible):
+    left = np.broadcast_to(np.arange(SIZE) < SIZE // 2, (SIZE, SIZE))
+    known = [
+        fit(bench(SILICA), visible, noise=NOISE, mask=mask).singular_values[0] ** 2
+        for mask in (None, left, ~left)
+    ]
+    # Information adds, and clean pictures end at the same coefficients. Only the best known
+    # direction turns a little from half to half.
+    assert known[1] + known[2] == pytest.approx(known[0], rel=0.02)
+
+
+def test_blocks_that_a_mask_cuts_count_only_where_few_are_whole():
+    cut = np.array([1.0, 1.0, 0.5, 0.2, 0.0])  # whole ones hold 2 of 2.7
+    np.testing.assert_array_equal(_counted(cut), [True, True, False, False, False])
+    few = np.array([1.0, 0.6, 0.5, 0.2, 0.0])  # 1 of 2.3
+    np.testing.assert_array_equal(_counted(few), [True, True, True, True, False])
+
+
+def test_dead_pixels_all_over_do_not_hide_the_ball():
+    film = Film(70, 70, VISIBLE.wavelengths)
+    target = with_noise(own_target(bench(BK7), film), 9)
+    dead = np.random.default_rng(1).random((70, 70)) < 0.5
+    target.radiance[dead] = 5.0
+    # Blocks of 3 x 3 pixels are whole once in 2⁹: the means of what is left have to do.
+    result = fit(bench(SILICA), target, mask=~dead)
+    assert result.converged, result.message
+    assert result.masked == np.sum(dead)
+    assert abs(result.n_d - float(BK7.n_d)) < 4 * result.n_d_std
+
+
+def test_a_mask_goes_with_a_picture_that_does_not_say_how_it_was_drawn():
+    film = Film(32, 32, VISIBLE.wavelengths)
+    clean = render(displaced(BK7), film, samples=256, dtype="float64")
+    noisy = with_noise(Picture(np.asarray(clean), film.wavelengths), 11)
+    mask = np.ones((32, 32), np.uint8)
+    mask[20:26, 10:20] = 0
+    noisy.radiance[mask == 0] = 3.0
+    free = ("ball.center", "ball.radius")
+    result = fit(bench(SILICA), noisy, free=free, noise=NOISE, mask=mask)
+    assert result.converged, result.message
+    assert result.samples == (16, 16, 64)
+    # As without a mask, in `test_place_and_size_from_a_picture_...`.
+    assert abs(result.n_d - float(BK7.n_d)) < 4 * result.n_d_std < 0.025
+
+
+def test_a_mask_that_shows_no_glass_is_no_fit(visible):
+    mask = np.zeros((SIZE, SIZE))
+    mask[0, 0] = 1
+    result = fit(bench(SILICA), visible, mask=mask)
+    assert not result.converged
+    assert "no pixel of the picture depends on this glass" in result.message
+
+
+@pytest.mark.parametrize(
+    ("mask", "words"),
+    [
+        (np.ones((2, 3)), r"mask \(2, 3\): must be \(2, 2\)"),
+        (np.ones((2, 2, 1)), r"mask \(2, 2, 1\): must be \(2, 2\)"),
+        (np.zeros((2, 2), bool), "mask: zero everywhere leaves nothing"),
+        (np.array([[1, 0], [1, 1]]), "target: 1 of its values are not finite"),
+    ],
+)
+def test_masks_that_do_not_fit_are_refused(mask, words):
+    radiance = np.array([[0.5, 0.5], [np.nan, 0.5]])[..., None]
+    with pytest.raises(ValueError, match=words):
+        fit(bench(), Picture(radiance, np.array([0.55])), mask=mask)
 
 
 # --- what else is free
@@ -432,6 +618,86 @@ def test_what_nothing_tells_is_said_to_be_unknown(visible):
     assert index_error(result, BK7) < 1e-9  # as without it
 
 
+# --- a check by resampling
+
+
+def test_noise_of_single_values_spreads_as_reported(visible):
+    target = with_noise(visible, 3)
+    result = fit(bench(SILICA), target, check="resample")
+    assert result.check.repeats == 50
+    assert result.check.ratio == result.check.n_d_std / result.n_d_std
+    # 10 % from 50 repeats, 6 % from the number of squares that show most of the index: 3 sigma.
+    assert 0.65 < result.check.ratio < 1.35
+    again = fit(bench(SILICA), target, check="resample")
+    assert again.check == result.check
+    assert fit(bench(SILICA), target).check is None
+
+
+def test_noise_that_hangs_together_spreads_more(visible):
+    each = np.random.default_rng(4).normal(0.0, NOISE, (SIZE, SIZE, 1))
+    target = replace(visible, radiance=visible.radiance + each)
+    result = fit(bench(SILICA), target, check="resample")
+    # The same error in 8 bands counts for 8 independent ones to the sandwich: the square root of
+    # 8 for what all bands tell alike.
+    assert 1.7 < result.check.ratio < 3.5
+
+
+@pytest.mark.parametrize("noise", [None, NOISE])
+def test_a_clean_picture_is_checked_at_the_noise_of_its_errors(visible, noise):
+    result = fit(bench(SILICA), visible, check="resample", noise=noise)
+    assert 0.65 < result.check.ratio < 1.35  # as above
+
+
+def test_what_shows_no_glass_is_not_checked(visible):
+    behind = Scene(camera(), (ball(SILICA, (0.0, 0.0, 20.0), name="ball"), screen()))
+    assert fit(behind, visible, check="resample").check is None
+
+
+# --- naming
+
+
+def test_one_glass_of_two():
+    # In one dimension, by hand: N(0; a, 1) of each, and N(0; 0, 1 + 2 a²) of any other.
+    offsets = np.array([[-1.5], [1.5]])
+    at, other = np.exp(-(1.5**2) / 2), 1 / np.sqrt(1 + 2 * 1.5**2)
+    likely, left = _probabilities(offsets)
+    np.testing.assert_allclose(likely, np.full(2, at / 2 / (at + other)), rtol=1e-12)
+    assert left == pytest.approx(other / (at + other), rel=1e-12)
+
+
+def test_another_glass_is_spread_as_the_table():
+    offsets = np.random.default_rng(1).normal(size=(9, 2)) * [4.0, 0.7] + [1.0, -2.0]
+    likely, left = _probabilities(offsets)
+    mean, precision = offsets.mean(0), np.linalg.inv(np.cov(offsets.T))
+    x = np.stack(np.meshgrid(np.linspace(-30, 30, 1201), np.linspace(-8, 8, 641)), -1)
+    off = x - mean
+    spread = np.exp(-np.sum((off @ precision) * off + x**2, axis=-1) / 2)
+    other = np.sum(spread) * 0.05 * 0.025 * np.sqrt(np.linalg.det(precision)) / (2 * np.pi)
+    each = np.exp(-np.sum(offsets**2, axis=1) / 2) / 9
+    # A sum over a grid much finer than the widths of smooth functions is the integral.
+    np.testing.assert_allclose(likely, each / (np.sum(each) + other), rtol=1e-6)
+    np.testing.assert_allclose(left, other / (np.sum(each) + other), rtol=1e-6)
+
+
+def test_who_knows_nothing_says_so():
+    likely, other = _probabilities(np.zeros((4, 3)))
+    np.testing.assert_allclose(likely, 1 / 8, rtol=1e-15)
+    assert other == 0.5
+    assert _probabilities(np.array([[1e9, 1e9], [1e9, -1e9]]))[1] == 1.0
+
+
+def test_a_glass_of_the_table_and_one_that_is_not(visible):
+    result = fit(bench(SILICA), with_noise(visible, 0))
+    assert len(result.probabilities) == len(result.nearest_glasses) == 5
+    assert result.probabilities[0] > 0.99  # its neighbours are hundreds of sigma away
+    assert sum(result.probabilities) + result.other_probability == pytest.approx(1, abs=1e-9)
+    # A melt that is off by 0.001, ten sigma.
+    melt = Sellmeier(np.asarray(BK7.B) * 1.0024, BK7.C)
+    other = fit(bench(SILICA), with_noise(own_target(bench(melt), VISIBLE), 0))
+    assert other.nearest_glasses[0][0] == "N-BK7"
+    assert other.other_probability > 0.99
+
+
 # --- progress, and JAX's switches
 
 
@@ -453,6 +719,62 @@ def test_an_exception_in_progress_ends_the_fit(visible):
 
     with pytest.raises(StopError):
         fit(bench(SILICA), visible, progress=stop)
+
+
+def stopped_at(calls: int, error: type[BaseException]) -> Callable[[int, float, float], None]:
+    """A `progress` that raises when it is called so often."""
+    left = [calls]
+
+    def progress(step: int, rms: float, n_d: float) -> None:
+        left[0] -= 1
+        if not left[0]:
+            raise error
+
+    return progress
+
+
+@pytest.mark.parametrize("error", [StopFit, KeyboardInterrupt])
+def test_a_fit_that_is_stopped_returns_the_best_so_far(visible, visible_fit, error):
+    told: list[float] = []
+    fit(bench(SILICA), visible, progress=lambda step, rms, n_d: told.append(rms))
+    for calls in (1, len(told)):
+        result = fit(bench(SILICA), visible, progress=stopped_at(calls, error))
+        assert result.stopped
+        assert not result.converged
+        where = "the coarse picture" if calls == 1 else "the last level"
+        assert result.message.startswith("stopped in step ")
+        assert "The fit was stopped: its answer may lie many of these errors away" in result.summary
+        assert result.message.endswith(f" of {where}")
+        # Of the point that progress was told of last, or of a better one of another start.
+        assert result.rms_residual <= told[calls - 1]
+        assert result.picture.shape == visible.radiance.shape
+        assert np.isfinite(result.n_d_std)
+    assert abs(result.n_d - float(BK7.n_d)) < 1e-4  # as in `test_progress_is_told`
+    assert not visible_fit.stopped
+    assert "stopped" not in visible_fit.summary
+
+
+def test_a_fit_that_is_stopped_on_blocks_shows_them():
+    target = own_target(bench(BK7), Film(70, 70, VISIBLE.wavelengths))
+    result = fit(bench(SILICA), target, progress=stopped_at(2, StopFit))
+    assert result.message.endswith(" of the coarse picture")
+    assert result.picture.shape == (70, 70, 8)
+    # Blocks of 3 pixels, and the last one continued to the border.
+    last = np.broadcast_to(result.picture[3, 66], (3, 4, 8))
+    np.testing.assert_array_equal(result.picture[3:6, 66:70], last)
+    # The means of the target's, which 4 samples instead of 36 show a little otherwise.
+    means = target.radiance[:69, :69].reshape(23, 3, 23, 3, 8).mean((1, 3))
+    assert np.median(np.abs(result.picture[:69:3, :69:3] - means)) < 0.03
+    assert "The last level used" not in result.summary
+
+
+def test_a_fit_without_a_point_has_nothing_to_return(visible, monkeypatch):
+    def interrupted(*_args: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("diffdisp.fitting._starts", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        fit(bench(SILICA), visible)
 
 
 def test_precision_is_double_and_the_switch_stays(visible, visible_fit):

@@ -1,6 +1,7 @@
 import json
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -12,7 +13,14 @@ import tifffile
 
 from diffdisp import image
 from diffdisp.color import decode_srgb, encode_srgb
-from diffdisp.image import Picture, check_output, linear_rgb, read_picture, write_picture
+from diffdisp.image import (
+    Picture,
+    check_output,
+    linear_rgb,
+    read_mask,
+    read_picture,
+    write_picture,
+)
 
 TARGETS = Path(__file__).parents[1] / "fixtures" / "targets"
 SUFFIXES = [".npz", ".png", ".tiff", ".tif", ".exr"]
@@ -456,3 +464,59 @@ def test_a_link_stays_a_link(tmp_path):
 def test_parts_of_a_picture_must_agree(radiance, wavelengths):
     with pytest.raises(ValueError, match=r"radiance|wavelength"):
         Picture(radiance, wavelengths)
+
+
+@pytest.mark.parametrize("name", ["m.npz", "n.npz", "m.png", "m.tiff", "m.exr", "n.tiff"])
+def test_a_mask_is_what_is_not_zero(tmp_path, name):
+    marked = np.zeros((3, 4), bool)
+    marked[1, 2] = marked[2, 0] = True
+    path, shown = tmp_path / name, marked[..., None] * np.float32([0.0, 1.0, 0.5])
+    if name == "n.npz":
+        np.savez(path, mask=marked)
+    elif name == "n.tiff":
+        tifffile.imwrite(path, marked.astype(np.uint8) * 255)
+    else:
+        write_picture(path, Picture(shown))
+    found = read_mask(path)
+    assert found.dtype == bool
+    np.testing.assert_array_equal(found, marked)
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"other": np.ones((2, 2))}, "it has no mask"),
+        ({"mask": np.ones(3)}, r"must be \(height, width\)"),
+        ({"mask": np.ones((0, 3))}, r"must be \(height, width\)"),
+        ({"mask": np.full((2, 2), np.nan)}, "finite numbers"),
+        ({"mask": np.full((2, 2), "white")}, "finite numbers"),
+    ],
+)
+def test_what_is_no_mask(tmp_path, fields, words):
+    np.savez(tmp_path / "m.npz", **fields)
+    with pytest.raises(ValueError, match=words):
+        read_mask(tmp_path / "m.npz")
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_a_png_tells_where_it_was_cut_off(tmp_path, bits):
+    top = 2**bits - 1
+    # What is just above is rounded to the top code, what is just below to the one beneath.
+    edges = decode_srgb((top - np.array([0.49, 0.51, 0.0])) / top)
+    write_picture(tmp_path / "a.png", Picture(edges[None, None]), bits=bits)
+    read = read_picture(tmp_path / "a.png")
+    np.testing.assert_array_equal(read.radiance[0, 0] >= read.ceiling, [True, False, True])
+    np.testing.assert_allclose(read.ceiling, (edges[0] + edges[1]) / 2, rtol=1e-6)
+
+
+def test_other_formats_have_no_ceiling(tmp_path):
+    for suffix in EXACT:
+        path = tmp_path / f"a{suffix}"
+        write_picture(path, replace(picture(3), ceiling=0.5))
+        assert read_picture(path).ceiling is None
+
+
+@pytest.mark.parametrize("ceiling", [0.0, -1.0, np.nan, np.inf])
+def test_a_ceiling_that_is_none(ceiling):
+    with pytest.raises(ValueError, match="ceiling must be positive and finite"):
+        replace(picture(3), ceiling=ceiling)

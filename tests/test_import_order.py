@@ -28,6 +28,7 @@ ORDER = (
     "chunks",
     "wavefront",
     "rendering",
+    "misfit",
     "linearised",
     "fitting",
     "scene_file",

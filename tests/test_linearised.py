@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from diffdisp.linearised import Columns, linearise
+from diffdisp.misfit import Clipped, Robust, misfit
 
 CHANNELS, BLOCKS, WIDEST = 3, 40, 3.0
 OTHERS, TOTAL = 6, 9
@@ -118,3 +119,69 @@ def test_what_weighs_nothing_does_not_count():
     assert abs(lin.noise / alone.noise - 1) < 1e-13
     np.testing.assert_allclose(np.abs(lin.q), np.abs(alone.q), rtol=1e-10, atol=1e-12)
     np.testing.assert_allclose(lin.rms, np.sqrt(np.mean((example.picture - example.target) ** 2)))
+
+
+def test_clipped_values_pull_by_their_likelihood():
+    example = Example(5)
+    where = np.random.default_rng(6).random((BLOCKS, CHANNELS)) < 0.3
+    clipped = Clipped(where, example.target, 0.5)
+    lin = linearise(
+        example.picture, example.target, example.columns, example.weights, WIDEST, clipped
+    )
+    told = misfit(example.picture, example.target, clipped)
+    jacobian = dense(example.columns)
+    weights = np.broadcast_to(example.weights, where.shape).ravel()
+    score = weights * told.score.ravel()
+    information = (jacobian * (weights * told.curvature.ravel())[:, None]).T @ jacobian
+    near = np.diag([(lin.noise / WIDEST) ** 2] * OTHERS + [0.0] * (TOTAL - OTHERS))
+    # Sums of 120 products: rounding.
+    np.testing.assert_allclose(lin.r.T @ lin.r, information + near, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(lin.r.T @ lin.q, jacobian.T @ score, rtol=1e-10, atol=1e-12)
+    spread = (jacobian * (score**2)[:, None]).T @ jacobian
+    meat = lin.r.T @ (lin.meat - lin.held) @ lin.r
+    np.testing.assert_allclose(meat, spread, rtol=1e-9, atol=1e-11)
+    # At a noise of 1 the spread of the score is the information, but for what weighs less.
+    white = (jacobian * (weights**2 * told.curvature.ravel())[:, None]).T @ jacobian
+    np.testing.assert_allclose(lin.r.T @ lin.white @ lin.r, white, rtol=1e-9, atol=1e-11)
+
+
+def test_no_value_is_clipped_where_none_is_marked(example):
+    nowhere = Clipped(np.zeros((BLOCKS, CHANNELS), bool), example.target, 0.1)
+    fixed = example.picture, example.target, example.columns, example.weights, WIDEST
+    for had, has in zip(example.lin, linearise(*fixed, nowhere), strict=True):
+        if not isinstance(had, Columns):
+            np.testing.assert_allclose(has, had, rtol=1e-12)
+
+
+@pytest.mark.parametrize("robust", [Robust("huber", 0.4), Robust("tukey", 0.6)], ids=str)
+def test_a_robust_step_and_its_spread_are_those_of_an_m_estimate(robust):
+    example = Example(7)
+    fixed = example.picture, example.target, example.columns, example.weights, WIDEST
+    lin = linearise(*fixed, robust=robust)
+    part, slope, height = robust.influence(example.residual.reshape(BLOCKS, CHANNELS))
+    pulls = part.ravel() * example.residual
+    of_index = np.max(np.abs(example.jacobian[:, OTHERS:]), axis=1) ** 2
+    mean = np.average(slope.ravel(), weights=of_index)
+    assert 0.1 < mean < 0.9  # some are outliers
+    information = example.jacobian.T @ example.jacobian
+    near = np.diag([(lin.noise / WIDEST) ** 2] * OTHERS + [0.0] * (TOTAL - OTHERS))
+    # Sums of 120 products: rounding.
+    np.testing.assert_allclose(lin.r.T @ lin.r, information + near, rtol=1e-10, atol=1e-11)
+    right = example.jacobian.T @ pulls / mean
+    np.testing.assert_allclose(lin.r.T @ lin.q, right, rtol=1e-10, atol=1e-11)
+    spread = (example.jacobian * (pulls**2)[:, None]).T @ example.jacobian / mean**2
+    meat = lin.r.T @ (lin.meat - lin.held) @ lin.r
+    np.testing.assert_allclose(meat, spread, rtol=1e-9, atol=1e-11)
+    np.testing.assert_allclose(lin.cost, np.sum(height.ravel() * example.residual**2), rtol=1e-12)
+    np.testing.assert_array_equal(lin.score, example.picture - example.target)
+
+
+def test_pulls_are_the_slope_of_the_cost(example):
+    lin = example.lin
+    np.testing.assert_allclose(lin.pulled(lin.pulls), lin.q, rtol=1e-9, atol=1e-12)
+    # One value alone, weighed.
+    one = np.zeros((BLOCKS, CHANNELS))
+    one[3, 1] = lin.pulls[3, 1]
+    row = np.ravel_multi_index((3, 1), one.shape)
+    expected = example.jacobian[row] * example.residual[row]
+    np.testing.assert_allclose(lin.r.T @ lin.pulled(one), expected, rtol=1e-9, atol=1e-12)

@@ -311,6 +311,7 @@ BAD_FITS = {
     "no such object": (SCENE + TWO_BALLS, "--object third", "third"),
     "nothing of that name": (SCENE, "--free ball.centre", "'ball.centre'"),
     "unknown prior": (SCENE, "--prior strong", "--prior"),
+    "unknown loss": (SCENE, "--loss cubes", "--loss"),
     "no noise": (SCENE, "--noise 0", "above 0"),
     "negative noise": (SCENE, "--noise -1", "above 0"),
     "noise not finite": (SCENE, "--noise nan", "finite"),
@@ -327,6 +328,24 @@ def test_bad_fit(tmp_path, target, out, capsys, text, options, phrase):
     (tmp_path / "bad.toml").write_text(text, encoding="utf-8")
     arguments = ["fit", str(tmp_path / "bad.toml"), target, "-o", str(out / "fit")]
     refused(capsys, arguments + options.split(), phrase)
+    assert list(out.iterdir()) == []
+
+
+# Bad masks: the keys of an .npz file, and what the message must say.
+BAD_MASKS = {
+    "another size": ({"radiance": np.ones((8, 6, 3))}, "mask (8, 6): must be (6, 8)"),
+    "all zero": ({"radiance": np.zeros((6, 8, 3))}, "leaves nothing to fit"),
+    "no picture": ({"other": np.ones((6, 8))}, "it has no mask"),
+}
+
+
+@pytest.mark.parametrize(("keys", "phrase"), BAD_MASKS.values(), ids=BAD_MASKS)
+def test_bad_mask(scene, target, tmp_path, out, capsys, keys, phrase):
+    np.savez(tmp_path / "mask.npz", **keys)
+    arguments = ["fit", scene, target, "-o", str(out / "fit"), "--mask"]
+    refused(capsys, [*arguments, str(tmp_path / "mask.npz")], phrase)
+    refused(capsys, [*arguments, str(tmp_path / "nosuch.png")], "nosuch.png: there is no such")
+    refused(capsys, [*arguments, str(tmp_path / "mask.txt")], "a picture ends in one of")
     assert list(out.iterdir()) == []
 
 
@@ -694,15 +713,27 @@ def test_fit(scene, target, out, capsys, fitted):
     assert (fitted["object_name"], fitted["prior"], fitted["free"]) == (None, "none", [])
     assert fitted["noise"] is None
     assert fitted["start"] is None
+    assert fitted["mask"] is None
+    assert (fitted["loss"], fitted["check"]) == ("squares", None)
 
 
 def test_fit_options(scene, target, out, fitted):
     options = ["--object", "ball", "--prior", "fixed-c3", "--noise", "1e-3", "--start", "f2"]
-    options += ["--free", "ball.center", "--free", "gain"]
+    options += ["--free", "ball.center", "--free", "gain", "--loss", "robust", "--check"]
     assert main(["fit", scene, target, "-o", str(out), *options]) == 0
     assert (fitted["object_name"], fitted["prior"], fitted["noise"]) == ("ball", "fixed-c3", 1e-3)
     assert fitted["start"].name == "F2"
     assert fitted["free"] == ["ball.center", "gain"]
+    assert (fitted["loss"], fitted["check"]) == ("robust", "resample")
+
+
+def test_fit_with_a_mask(scene, target, tmp_path, out, fitted):
+    mask = np.zeros((6, 8, 3), np.uint8)
+    mask[1:5, 2:6] = 255
+    iio.imwrite(tmp_path / "mask.png", mask)
+    options = ["--mask", str(tmp_path / "mask.png")]
+    assert main(["fit", scene, target, "-o", str(out), *options]) == 0
+    np.testing.assert_array_equal(fitted["mask"], mask[..., 0] > 0)
 
 
 def test_fit_that_does_not_converge(scene, target, out, capsys, fitted):
@@ -710,6 +741,36 @@ def test_fit_that_does_not_converge(scene, target, out, capsys, fitted):
     assert main(["fit", scene, target, "-o", str(out)]) == 3
     assert "converged  NO" in capsys.readouterr().out
     assert {file.name for file in out.iterdir()} == {"fit.json", "report.png"}
+
+
+def test_ctrl_c_keeps_the_fit_so_far(scene, target, out, capsys, monkeypatch):
+    whole = fitting.fit
+
+    def interrupted(*args, progress, **options):
+        def tell(step, residual, n_d):
+            progress(step, residual, n_d)
+            raise KeyboardInterrupt
+
+        return whole(*args, progress=tell, **options)
+
+    monkeypatch.setattr("diffdisp.fitting.fit", interrupted)
+    assert main(["fit", scene, target, "-o", str(out / "fit")]) == 130
+    told = capsys.readouterr()
+    assert told.err == f"diffdisp: interrupted: {out / 'fit'} holds the fit so far\n"
+    assert "message    stopped in step 1 of the coarse picture" in told.out
+    written = json.loads((out / "fit" / "fit.json").read_text(encoding="utf-8"))
+    assert (written["converged"], written["stopped"]) == (False, True)
+    assert (out / "fit" / "report.png").is_file()
+
+
+def test_ctrl_c_before_a_fit_has_a_point(scene, target, out, capsys, monkeypatch):
+    def interrupted(*args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("diffdisp.fitting._starts", interrupted)
+    assert main(["fit", scene, target, "-o", str(out / "fit")]) == 130
+    assert capsys.readouterr() == ("", "diffdisp: interrupted, nothing written\n")
+    assert list(out.iterdir()) == []
 
 
 # The process.
@@ -764,8 +825,9 @@ def test_compile_cache_of_somebody_else_is_kept(monkeypatch, tmp_path):
     assert not (tmp_path / "other").exists()
 
 
-def test_priors_are_those_of_the_fit():
+def test_choices_are_those_of_the_fit():
     assert command_line.PRIORS == fitting.PRIORS
+    assert command_line.LOSSES == fitting.LOSSES
 
 
 def test_help_and_version(capsys):

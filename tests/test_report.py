@@ -7,7 +7,7 @@ import pytest
 from fake_fit import BANDS, blurred_ring, fake_result, fake_target
 
 from diffdisp.dispersion import Sellmeier
-from diffdisp.fitting import FreeValue
+from diffdisp.fitting import FreeValue, Resampled
 from diffdisp.glasses import named_glass
 from diffdisp.image import Picture
 from diffdisp.report import (
@@ -22,8 +22,10 @@ KEYS = {
     *("converged", "message", "steps", "B", "C", "B_std", "C_std", "covariance", "n_d"),
     *("n_d_std", "V_d", "V_d_std", "P_gF", "wavelength", "n", "n_std", "singular_values"),
     *("determined", "summary", "rms_residual", "nearest_glasses"),
-    *("object", "prior", "P_gF_std", "free"),
+    *("object", "prior", "P_gF_std", "free", "left_out", "loss", "other_glass_probability"),
+    *("stopped", "check"),
 }
+LEFT_OUT = ("masked_pixels", "clipped_values", "outlying_values")
 
 
 def size_of(path):
@@ -65,6 +67,33 @@ def test_what_was_free_is_told():
     assert "gain[" not in table
     one = result_table(fake_result(free=(FreeValue("gain[0]", 1.1, 2e-3),)))
     assert "gain       1.1000 ± 0.0020\n" in one
+
+
+def test_how_likely_the_nearest_glasses_are(tmp_path):
+    likely = (0.91, 0.0849, 3e-4, 0.0, 0.0)
+    result = fake_result(probabilities=likely, other_probability=0.0048)
+    told = fit_json(result)
+    assert [entry["probability"] for entry in told["nearest_glasses"]] == list(likely)
+    assert [set(entry) for entry in told["nearest_glasses"]] == [
+        {"name", "distance", "probability"}
+    ] * 5
+    assert told["other_glass_probability"] == 0.0048
+    first, second = (name for name, _ in result.nearest_glasses[:2])
+    line = f"glass      {first} 0.910, {second} 0.085, none of the table 0.005\n"
+    assert line in result_table(result)
+    assert "glass  " not in result_table(fake_result())
+    write_report(tmp_path / "a.png", result, fake_target())
+    write_report(tmp_path / "b.png", fake_result(), fake_target())
+    assert (tmp_path / "a.png").read_bytes() != (tmp_path / "b.png").read_bytes()
+
+
+def test_a_check_is_told():
+    assert fit_json(fake_result())["check"] is None
+    assert "check" not in result_table(fake_result())
+    result = fake_result(check=Resampled(51, 4e-6, 1.3))
+    assert fit_json(result)["check"] == {"repeats": 51, "n_d_std": 4e-6, "ratio": 1.3}
+    # A standard deviation of 51 is known to a tenth.
+    assert "check      resampled n_d spreads 1.30 ± 0.13 times its error\n" in result_table(result)
 
 
 def test_json_has_null_for_what_is_not_finite(tmp_path):
@@ -177,6 +206,23 @@ def test_report_shows_the_residual(tmp_path):
     shifted = np.roll(blurred_ring(32, 16), 3, axis=1)
     write_report(tmp_path / "b.png", fake_result(picture=shifted), fake_target())
     assert (tmp_path / "a.png").read_bytes() != (tmp_path / "b.png").read_bytes()
+
+
+def test_what_a_mask_left_out_is_told_and_not_drawn(tmp_path):
+    used = np.ones((32, 32), bool)
+    assert fit_json(fake_result())["left_out"] == dict.fromkeys(LEFT_OUT, 0)
+    assert "left out" not in result_table(fake_result())
+    used[4:8, 4:8] = False
+    result = fake_result(used=used, clipped=7, outliers=9)
+    assert fit_json(result)["left_out"] == dict(zip(LEFT_OUT, (16, 7, 9), strict=True))
+    assert "left out   16 pixels by the mask\n" in result_table(result)
+    write_report(tmp_path / "a.png", result, fake_target())
+    # What a masked pixel holds changes neither the picture of the residual nor its scale.
+    spoiled = fake_target().radiance.copy()
+    spoiled[4:8, 4:8] = np.nan
+    write_report(tmp_path / "b.png", result, Picture(spoiled, BANDS))
+    drawn, again = (iio.imread(tmp_path / name)[:480, 1080:] for name in ("a.png", "b.png"))
+    np.testing.assert_array_equal(drawn, again)
 
 
 @pytest.mark.parametrize(

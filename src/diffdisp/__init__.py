@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from diffdisp.color import encode_srgb
     from diffdisp.dispersion import Sellmeier
     from diffdisp.film import Film, band_middles
-    from diffdisp.fitting import FitResult, FreeValue, fit
+    from diffdisp.fitting import FitResult, FreeValue, Resampled, StopFit, fit
     from diffdisp.geometry import Plane, Sphere
     from diffdisp.glasses import glass_source, glass_table, load_glass, named_glass
     from diffdisp.image import Picture, linear_rgb, read_picture, write_picture
@@ -40,11 +40,13 @@ __all__ = [
     "Picture",
     "Plan",
     "Plane",
+    "Resampled",
     "Scene",
     "SceneError",
     "Sellmeier",
     "Solid",
     "Sphere",
+    "StopFit",
     "band_middles",
     "encode_srgb",
     "fit",
@@ -71,7 +73,7 @@ _NAMES = {
     "color": ("encode_srgb",),
     "dispersion": ("Sellmeier",),
     "film": ("Film", "band_middles"),
-    "fitting": ("FitResult", "FreeValue", "fit"),
+    "fitting": ("FitResult", "FreeValue", "Resampled", "StopFit", "fit"),
     "geometry": ("Plane", "Sphere"),
     "glasses": ("glass_source", "glass_table", "load_glass", "named_glass"),
     "image": ("Picture", "linear_rgb", "read_picture", "write_picture"),

@@ -18,7 +18,7 @@ from typing import Any, NoReturn
 DONE, BAD_INPUT, NOT_CONVERGED, INTERRUPTED = 0, 2, 3, 130
 """Exit statuses; 130 is what shells give for Ctrl-C."""
 
-PRIORS = ("none", "catalogue", "fixed-c3")
+PRIORS, LOSSES = ("none", "catalogue", "fixed-c3"), ("squares", "robust")
 """Those of `fitting`, which is too heavy to be asked."""
 
 QUALITY = {"draft": 4, "standard": 16, "reference": 256}
@@ -164,7 +164,8 @@ _BANDS_HELP = "nm; equal bands, seen at their middles, as 400:700:16 (default: c
 def _add_fit(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Recover B and C of a glass ball from a picture. The scene says where everything is and "
-        "which glass to start from. Exit status 3: it did not converge; the files are written."
+        "which glass to start from. Exit status 3: it did not converge; the files are written. "
+        "Ctrl-C writes the best point so far; the exit status is 130 then."
     )
     parser.set_defaults(run=_fit)
     add = parser.add_argument
@@ -174,8 +175,13 @@ def _add_fit(parser: argparse.ArgumentParser) -> None:
     add("--object", metavar="NAME", help="the ball, where the scene has several of glass")
     add("--free", action="append", default=[], metavar="NAME", help=_FREE_HELP)
     add("--prior", choices=PRIORS, default="none", help="what is known beforehand (default none)")
+    add("--loss", choices=LOSSES, default="squares", help="robust: outliers do not count")
+    add("--check", action="store_true", help="of n_d's error, by resampling the residual")
     add("--noise", type=_noise, metavar="SIGMA", help="of the radiance (default: estimated)")
     add("--start", metavar="GLASS", help="glass to start from (default: that of the scene)")
+    add(
+        "--mask", metavar="FILE", help="a picture of TARGET's size; where it is 0 nothing is fitted"
+    )
 
 
 _FREE_HELP = (
@@ -379,12 +385,13 @@ def _fit(options: argparse.Namespace) -> int:
     _check_folder(folder)
     from diffdisp.fitting import fit
     from diffdisp.glasses import load_glass
-    from diffdisp.image import read_picture
+    from diffdisp.image import read_mask, read_picture
     from diffdisp.report import result_table, write_fit_json, write_report
     from diffdisp.scene_file import load_scene
 
     scene, target = load_scene(options.scene), read_picture(options.target)
     start = None if options.start is None else load_glass(options.start)
+    mask = None if options.mask is None else read_mask(options.mask)
     _keep_compiled()
     with _progress_bar("fitting", "step") as bar:
 
@@ -400,12 +407,17 @@ def _fit(options: argparse.Namespace) -> int:
             prior=options.prior,
             noise=options.noise,
             start=start,
+            mask=mask,
+            loss=options.loss,
+            check="resample" if options.check else None,
             progress=progress,
         )
     folder.mkdir(parents=True, exist_ok=True)
     write_report(folder / "report.png", result, target)
     write_fit_json(folder / "fit.json", result)
     print(result_table(result))
+    if result.stopped:
+        return _complain(f"interrupted: {folder} holds the fit so far", INTERRUPTED)
     return DONE if result.converged else NOT_CONVERGED
 
 

@@ -45,6 +45,7 @@ from diffdisp.glasses import glass_table
 from diffdisp.image import Picture
 from diffdisp.integrator import Lanes, followed_radiance, lane_radiance
 from diffdisp.linearised import Columns, Eliminated, Linearised, linearise
+from diffdisp.misfit import Clipped, Robust
 from diffdisp.parameters import Parameter, Place, named_parameters, value_at, with_coordinates
 from diffdisp.planning import Plan, make_plan
 from diffdisp.programs import OPTIONS
@@ -108,6 +109,9 @@ UNDERSTATED = (
 """What has to be said of errors beside free numbers of the scene: on the bench at a noise of 1 %,
 with place and radius of the ball free, n_d was up to 5.4 reported standard deviations off."""
 
+UNFINISHED = " The fit was stopped: its answer may lie many of these errors away."
+"""What has to be said of errors that are those about a point, which is no minimum yet."""
+
 POLISH = 6
 """Steps more, at most, where more than the glass is free: a scene's numbers move the picture less
 nearly in straight lines."""
@@ -127,8 +131,44 @@ to all of them alike."""
 
 PRIORS = ("none", "catalogue", "fixed-c3")
 
+LOSSES = ("squares", "robust")
+
+SETTLE, SETTLED = 100, 0.01
+"""Steps at most, on one traced picture, of what is no least-squares problem: until one changes the
+picture by less than this part of its noise."""
+
 COLOR_WAVELENGTHS = np.arange(430, 681, 10) / 1e3
 """Where a fit to a colour picture reports n(λ), µm: beyond, sRGB sees almost nothing."""
+
+
+CHECKS = ("resample",)
+
+REPEATS = 50
+"""Of a check by resampling: its spread is then known to 10 %, in some ten seconds."""
+
+TOGETHER = 3
+"""Pixels along each side of the squares whose misfits a check turns together."""
+
+COARSE, FEW, LAST = "the coarse picture", "the whole picture at few samples", "the last level"
+"""What the levels of a fit are called."""
+
+
+class StopFit(Exception):
+    """Raised by `progress`, ends a fit, which then returns the best point so far."""
+
+
+class Resampled(NamedTuple):
+    """What a check by resampling found.
+
+    Args:
+        repeats: how many.
+        n_d_std: standard deviation of their n_d.
+        ratio: of that to the one reported.
+    """
+
+    repeats: int
+    n_d_std: float
+    ratio: float
 
 
 class FreeValue(NamedTuple):
@@ -181,6 +221,15 @@ class FitResult:
         samples: film samples per pixel of the last level: of most pixels, of the hardest.
         picture: (height, width, channels) render with the fitted glass, exposed as the target.
         free: what else was free.
+        used: (height, width) pixels that the fit went by; None where it was all of them.
+        clipped: how many of their values were cut off and count as "at least that bright".
+        loss: "squares" or "robust".
+        outliers: how many values the robust loss left out at the end.
+        probabilities: of `nearest_glasses`, that the ball is made of each.
+        other_probability: that it is of none of the table.
+        stopped: whether it was told to stop; all else is then of the best point so far, and
+            `picture` is 0 where nothing had been rendered.
+        check: of the errors, where one was asked for and something depends on the glass.
     """
 
     scene: Scene
@@ -213,6 +262,19 @@ class FitResult:
     samples: tuple[int, ...]
     picture: np.ndarray
     free: tuple[FreeValue, ...] = ()
+    used: np.ndarray | None = None
+    clipped: int = 0
+    loss: str = "squares"
+    outliers: int = 0
+    probabilities: tuple[float, ...] = ()
+    other_probability: float = float("nan")
+    stopped: bool = False
+    check: Resampled | None = None
+
+    @property
+    def masked(self) -> int:
+        """How many pixels a mask left out."""
+        return 0 if self.used is None else int(np.sum(~self.used))
 
 
 class Coefficients(eqx.Module):
@@ -356,10 +418,14 @@ class Problem(NamedTuple):
         number: number of the ball among the objects.
         ball: its number among those of glass.
         film: the target's.
-        target: (height, width, channels).
+        target: (height, width, channels); 0 where it is not used.
+        used: (height, width) pixels that count.
+        ceiling: from which on values are clipped; infinity where none are.
         unknowns: what is looked for.
         free: what else is.
+        loss: one of `LOSSES`.
         progress: called with the step, the root mean square residual and n_d.
+        kept: the best point so far, and its level, once there is one; it is kept up to date.
     """
 
     scene: Scene
@@ -367,9 +433,13 @@ class Problem(NamedTuple):
     ball: int
     film: Film
     target: np.ndarray
+    used: np.ndarray
+    ceiling: float
     unknowns: Unknowns
     free: Free
+    loss: str
     progress: Callable[[int, float, float], None]
+    kept: "list[tuple[Level, Descent]]"
 
 
 class Part(NamedTuple):
@@ -401,16 +471,26 @@ class Level(NamedTuple):
     """One resolution of the problem.
 
     Args:
-        parts: what renders it; the shares of each block's parts sum to 1.
+        name: what it is called.
+        size: of a block, pixels along each side.
+        blocks: (blocks,) numbers of those that count, row by row over the film.
+        parts: what renders them; the shares of each block's parts sum to 1.
         target: (blocks, channels).
         weights: (blocks, 1) of the squared residuals.
         seed: of the render.
+        clipped: values of the target that were cut off; None where there are none.
+        robust: the loss; None for squares.
     """
 
+    name: str
+    size: int
+    blocks: np.ndarray
     parts: tuple[Part, ...]
     target: np.ndarray
     weights: np.ndarray
     seed: int
+    clipped: Clipped | None
+    robust: Robust | None
 
 
 def fit(
@@ -422,6 +502,9 @@ def fit(
     prior: str = "none",
     noise: float | None = None,
     start: Sellmeier | None = None,
+    mask: np.ndarray | None = None,
+    loss: str = "squares",
+    check: str | None = None,
     progress: Callable[[int, float, float], None] | None = None,
 ) -> FitResult:
     """The Sellmeier coefficients of a glass ball from a picture of it, in float64.
@@ -429,7 +512,8 @@ def fit(
     Args:
         scene: what the picture shows; the ball's glass in it is where the fit starts.
         target: the picture; its film is the fit's. Its `samples`, `depth` and `seed` are used in
-            the last level where it has them.
+            the last level where it has them. Values that reach its `ceiling` were cut off: they
+            count as "at least that bright".
         object_name: the ball, where the scene has several of glass.
         free: what is not known well beside the glass and is fitted too, from its value in the
             scene: numbers of the scene by name, such as "ball.center", "ball.center.z",
@@ -441,28 +525,62 @@ def fit(
         noise: standard deviation of the target's values where it is known; otherwise errors are
             estimated from the residual, heteroscedasticity-consistent.
         start: a glass to start from instead of the scene's.
-        progress: called with the step, the root mean square residual and n_d.
+        mask: (height, width) of the target; pixels where it is zero or False are left out of the
+            fit and of its errors. They may hold anything, NaN too.
+        loss: "squares"; or "robust", by which values far off what most others show, in units of
+            their spread, pull no stronger (Huber) on the way and not at all (Tukey) in the end.
+            Errors are then those of the M-estimate.
+        check: "resample": the last step is repeated with the misfits of squares of pixels turned
+            round at random, which shows whether the error reported of n_d is the spread that
+            noise of this kind gives it. It takes the picture as linear near the answer, and does
+            not know errors of the scene or of the render.
+        progress: called with the step, the root mean square residual and n_d. It may raise
+            `StopFit`.
 
     Returns:
-        The glass, its errors and how the fit ended; look at `converged`.
+        The glass, its errors and how the fit ended; look at `converged`. After `StopFit`, or
+        Ctrl-C once there is a first point, those of the best point so far: `stopped` is true then
+        and `converged` false, and `message` says at which level.
 
     Raises:
         ValueError: no such glass ball, or several and no name; a start with a pole in the band or
             without any free coefficient; an unknown prior; a noise that is not positive; a name
-            in `free` that the scene does not have.
+            in `free` that the scene does not have; a mask of another size, or that leaves
+            nothing; values that are used and not finite.
     """
     if prior not in PRIORS:
         raise ValueError(f"prior {prior!r}: allowed are {', '.join(PRIORS)}")
+    if loss not in LOSSES:
+        raise ValueError(f"loss {loss!r}: allowed are {', '.join(LOSSES)}")
+    if check is not None and check not in CHECKS:
+        raise ValueError(f"check {check!r}: allowed are {', '.join(CHECKS)}")
     if noise is not None and not (np.isfinite(noise) and noise > 0):
         raise ValueError(f"noise {noise}: must be a finite number above 0")
     number = _glass_object(scene, object_name)
     if start is not None:
         scene = with_glass(scene, number, start)
-    film = target.film
-    check_glasses(scene, *film_range(film))
+    check_glasses(scene, *film_range(target.film))
+    used = _used(target, mask)
+    target = replace(target, radiance=np.where(used[..., None], target.radiance, 0.0))
     with jax.enable_x64(True):
-        problem = _problem(scene, number, target, free, prior, progress or _silent)
-        return _fit(problem, target, prior, noise)
+        problem = _problem(scene, number, target, used, free, prior, loss, progress or _silent)
+        return _fit(problem, target, prior, noise, check)
+
+
+def _used(target: Picture, mask: np.ndarray | None) -> np.ndarray:
+    """Pixels (height, width) of a target that a mask does not leave out."""
+    size = target.radiance.shape[:2]
+    used = np.ones(size, bool) if mask is None else np.asarray(mask) != 0
+    if used.shape != size:
+        raise ValueError(f"mask {used.shape}: must be {size}, (height, width) of the target")
+    if not used.any():
+        raise ValueError("mask: zero everywhere leaves nothing to fit")
+    broken = np.count_nonzero(~np.isfinite(target.radiance[used]))
+    if broken:
+        raise ValueError(
+            f"target: {broken} of its values are not finite; a mask may leave them out"
+        )
+    return used
 
 
 def _silent(step: int, rms: float, n_d: float) -> None:
@@ -486,8 +604,10 @@ def _problem(
     scene: Scene,
     number: int,
     target: Picture,
+    used: np.ndarray,
     free: Sequence[str],
     prior: str,
+    loss: str,
     progress: Callable[[int, float, float], None],
 ) -> Problem:
     film = target.film
@@ -512,7 +632,21 @@ def _problem(
     ball = [i for i, obj in enumerate(scene.objects) if is_glass(obj)].index(number)
     unknowns = Unknowns(coefficients, reference, project, mean, rows)
     others = _free(scene, number, target, free)
-    return Problem(scene, number, ball, film, target.radiance, unknowns, others, progress)
+    ceiling = np.inf if target.ceiling is None else target.ceiling
+    return Problem(
+        scene,
+        number,
+        ball,
+        film,
+        target.radiance,
+        used,
+        ceiling,
+        unknowns,
+        others,
+        loss,
+        progress,
+        [],
+    )
 
 
 def _free(scene: Scene, number: int, target: Picture, names: Sequence[str]) -> Free:
@@ -560,18 +694,61 @@ def _by_C(C: Array) -> np.ndarray:
 
 
 def _level(
-    problem: Problem, size: int, samples: int, depth: int, seed: int, split: int = 1
+    problem: Problem,
+    name: str,
+    size: int,
+    samples: int,
+    depth: int,
+    seed: int,
+    split: int = 1,
 ) -> Level:
     """The problem in blocks of `size` pixels, each with `samples` · `split`² samples.
 
-    What fills no block at the border is left out.
+    What fills no block at the border is left out; where that is all, the blocks are pixels.
     """
-    film, target = problem.film, problem.target
+    film = problem.film
     width, height = film.width // size, film.height // size
-    cut = target[: height * size, : width * size]
-    means = cut.reshape(height, size, width, size, -1).mean((1, 3)).reshape(height * width, -1)
-    part = _part(problem, size, samples, depth, np.arange(height * width), split)
-    return Level((part,), means, np.ones((len(means), 1)), seed)
+
+    def means(values: np.ndarray) -> np.ndarray:
+        cut = values[: height * size, : width * size]
+        return cut.reshape(height, size, width, size, -1).mean((1, 3)).reshape(height * width, -1)
+
+    share = means(problem.used)
+    blocks = np.flatnonzero(_counted(share[:, 0]))
+    if not len(blocks):
+        return _level(problem, name, 1, samples, depth, seed, split)
+    share = share[blocks]
+    part = _part(problem, size, samples, depth, blocks, np.arange(len(blocks)), split)
+    target = means(problem.target)[blocks] / share
+    clipped = _clipped(problem, means, blocks, share)
+    robust = Robust("huber", problem.free.brightest) if problem.loss == "robust" else None
+    return Level(name, size, blocks, (part,), target, share, seed, clipped, robust)
+
+
+def _clipped(
+    problem: Problem,
+    means: Callable[[np.ndarray], np.ndarray],
+    blocks: np.ndarray,
+    share: np.ndarray,
+) -> Clipped | None:
+    """The values of some blocks that were cut off; a block with one such is at least its mean."""
+    over = problem.target >= problem.ceiling
+    if not over.any():
+        return None
+    least = means(np.minimum(problem.target, problem.ceiling))[blocks] / share
+    return Clipped(means(over)[blocks] > 0, least, CLEAN * problem.free.brightest)
+
+
+def _counted(share: np.ndarray) -> np.ndarray:
+    """Which blocks count, by the part (blocks,) of each one's pixels that are used.
+
+    The mean of some pixels of a block is not quite what a render of the whole block shows. So
+    blocks that are cut count only where the whole ones hold less than half of the used pixels, as
+    in a large picture with dead pixels all over: with the mean of their used pixels, weighed by
+    their part. At single pixels every block is whole or does not count.
+    """
+    whole = share == 1
+    return whole if 2 * np.sum(share[whole]) >= np.sum(share) else share > 0
 
 
 def _part(
@@ -579,16 +756,17 @@ def _part(
     size: int,
     samples: int,
     depth: int,
+    blocks: np.ndarray,
     rows: np.ndarray,
     split: int = 1,
     share: float = 1.0,
 ) -> Part:
-    """The blocks of `size` pixels with numbers `rows`, at `samples` · `split`² samples."""
+    """The blocks of `size` pixels with numbers `blocks`, at `samples` · `split`² samples."""
     film = problem.film
     plan = replace(make_plan(problem.scene, film, samples, depth, "float64"), dispersive=True)
     spectrum = film_spectrum(film, plan)
     width = film.width // size
-    y, x = np.divmod(rows[:, None], width)
+    y, x = np.divmod(blocks[:, None], width)
     down, right = np.divmod(np.arange(split**2), split)
     numbers = (y * split + down) * (width * split) + x * split + right
     count = chunk_pixels(film, plan)
@@ -721,7 +899,70 @@ def _linearise(
         free.total,
         free.total + len(problem.unknowns.project),
     )
-    return linearise(radiance[:, 0] + black, level.target, columns, level.weights, WIDEST)
+    return _reduced(level, radiance[:, 0] + black, columns)
+
+
+def _reduced(level: Level, picture: np.ndarray, columns: Columns) -> Linearised:
+    """A level's picture and its slopes, reduced to what a step needs."""
+    told = level.clipped, level.robust
+    return linearise(picture, level.target, columns, level.weights, WIDEST, *told)
+
+
+def _rescaled(level: Level, lin: Linearised, brightest: float) -> tuple[Level, Linearised]:
+    """A level with the noise that its picture shows, where its misfits have to know it.
+
+    The median for clipped values is that of flat parts of a picture, where most of them are; the
+    one for a robust loss goes by what each value tells of the index, since noise on edges, where
+    the index shows, is often larger and no outlier.
+    """
+    if level.clipped is None and level.robust is None:
+        return level, lin
+    least = CLEAN * brightest
+    if level.clipped is not None:
+        ordinary = np.abs(lin.score)[~level.clipped.where]
+        noise = max(_deviation(ordinary, np.ones_like(ordinary)), least)
+        level = level._replace(clipped=level.clipped._replace(noise=noise))
+    if level.robust is not None:
+        spread = max(_deviation(_weighed(level, lin), lin.weight**2), least)
+        level = level._replace(robust=level.robust._replace(spread=spread))
+    return level, _reduced(level, lin.picture, lin.columns)
+
+
+def _weighed(level: Level, lin: Linearised) -> np.ndarray:
+    """Size (blocks, channels) of what a robust loss takes."""
+    return np.abs(lin.score) * np.sqrt(level.weights)
+
+
+def _deviation(sizes: np.ndarray, counts: np.ndarray) -> float:
+    """Standard deviation of normal noise by the median of its sizes, each as often as it counts.
+
+    1.4826 = 1 / Φ⁻¹(3/4) median deviations are the standard deviation.
+    """
+    sizes, counts = sizes[counts > 0], counts[counts > 0]
+    if not sizes.size:
+        return 0.0
+    order = np.argsort(sizes)
+    part = np.cumsum(counts[order]) / np.sum(counts)
+    return float(1.4826 * sizes[order][np.searchsorted(part, 0.5)])
+
+
+def _settled(
+    problem: Problem, level: Level, at: Point, anchor: np.ndarray, lin: Linearised
+) -> tuple[Level, Point, Linearised]:
+    """Where the least misfit lies if the picture is linear: steps without tracing.
+
+    Squares need one step. What clipped values and outliers pull changes on the way.
+    """
+    for _ in range(SETTLE):
+        new, change = _next_point(problem.unknowns, at, anchor, lin, 0.0)
+        if level.clipped is None and level.robust is None:
+            return level, new, lin.moved(change)
+        visible = np.linalg.norm(lin.r @ change)
+        moved = _reduced(level, lin.picture + lin.columns.along(change), lin.columns)
+        at, (level, lin) = new, _rescaled(level, moved, problem.free.brightest)
+        if visible < SETTLED * lin.noise:
+            break
+    return level, at, lin
 
 
 class Step(NamedTuple):
@@ -826,12 +1067,16 @@ class Descent(NamedTuple):
         lin: the picture linearised there.
         steps: pictures traced.
         converged: whether a next step would change nothing that the picture can tell.
+        spread: of misfits that are no outliers, where the loss is robust; else 0.
+        anchor: where z stays if the picture says nothing.
     """
 
     at: Point
     lin: Linearised
     steps: int
     converged: bool
+    spread: float
+    anchor: np.ndarray
 
 
 def _descend(
@@ -855,6 +1100,14 @@ def _descend(
         along: where slopes along the scene's numbers are taken; by default on the level itself.
     """
 
+    def keep() -> None:
+        spread = level.robust.spread if level.robust else 0.0
+        now = Descent(at, lin, steps, False, spread, anchor)
+        # Several starts compete on the coarse picture, and there only.
+        others = [end for at_level, end in problem.kept if at_level.name == level.name == COARSE]
+        if all(lin.cost <= end.lin.cost for end in others):
+            problem.kept[:] = [(level, now)]
+
     def look(at: Point, known: Columns | None = None) -> Linearised:
         if known is None and along is not None:
             known = _linearise(problem, along, at, cutoff).columns
@@ -862,8 +1115,11 @@ def _descend(
 
     unknowns = problem.unknowns
     least = LEAST_CHANGE[0] if problem.film.wavelengths is not None else LEAST_CHANGE[1]
-    lin, damping, converged = look(at), 0.0, False
+    brightest = problem.free.brightest
+    level, lin = _rescaled(level, look(at), brightest)
+    damping, converged = 0.0, False
     steps, anchor = 1, at.z
+    keep()
     while steps < most and not converged:
         problem.progress(steps, lin.rms, _n_d(unknowns, at.z))
         # Whether a minimum is near, a step tells that nothing holds back.
@@ -871,7 +1127,8 @@ def _descend(
         largest, visible = _largest(unknowns, at, new), np.linalg.norm(lin.r @ change)
         if largest < least or visible < small * lin.noise:
             # So near the picture is linear: it need not be traced again.
-            at, lin, converged = new, lin.moved(change), True
+            level, at, lin = _settled(problem, level, at, anchor, lin)
+            converged = True
             break
         if damping:
             new, change = _next_point(unknowns, at, anchor, lin, damping)
@@ -888,10 +1145,13 @@ def _descend(
         if has > had and largest < 100 * least:
             converged = True  # what is left of the residual is rounding
         elif has <= had or rough:
-            at, lin, damping = new, tried, damping / 10 if damping > 1e-2 else 0.0
+            at, damping = new, damping / 10 if damping > 1e-2 else 0.0
+            level, lin = _rescaled(level, tried, brightest)
+            keep()
         else:
             damping = max(10 * damping, 1.0)
-    return Descent(at, lin, steps, converged)
+    spread = level.robust.spread if level.robust else 0.0
+    return Descent(at, lin, steps, converged, spread, anchor)
 
 
 def _largest(unknowns: Unknowns, at: Point, new: Point) -> float:
@@ -927,7 +1187,16 @@ def _refined(problem: Problem, few: Descent, level: Level, depth: int) -> tuple[
     hard = np.zeros(len(change), bool)
     hard[np.argsort(-change)[: int(np.sum(some.weight.any(axis=1)) * REFINED)]] = True
     parts = tuple(
-        _part(problem, 1, FEW_SAMPLES, depth, np.flatnonzero(which), split, share)
+        _part(
+            problem,
+            1,
+            FEW_SAMPLES,
+            depth,
+            level.blocks[which],
+            np.flatnonzero(which),
+            split,
+            share,
+        )
         for which, split, share in (
             (~hard, SPLITS[0], 1.0),
             (hard, SPLITS[0], -1 / 3),
@@ -939,17 +1208,16 @@ def _refined(problem: Problem, few: Descent, level: Level, depth: int) -> tuple[
     # What a quarter of the samples changes tells the error of these, and so what a residual tells.
     error = np.max(np.abs(some.picture - few.lin.picture), axis=1, keepdims=True) / 3
     error[hard] /= SPLITS[1] ** 2 / SPLITS[0] ** 2
-    residual = np.abs(some.picture - level.target)[some.weight > 0]
-    # 1.4826 median deviations of normal noise are its standard deviation.
-    median = float(np.median(residual)) if residual.size else 0.0
-    sigma = max(1.4826 * median, CLEAN * problem.free.brightest)
+    residual = np.abs(some.score)[some.weight > 0]
+    shown = _deviation(residual, np.ones_like(residual))
+    sigma = max(shown, CLEAN * problem.free.brightest)
     weights = 1 / (1 + (error / sigma) ** 2)
     if problem.free.parameters:
-        weights *= _resolved(problem, few.lin.columns, some.columns)
+        weights *= _resolved(problem, level.blocks, few.lin.columns, some.columns)
     return level._replace(parts=parts, weights=weights), at
 
 
-def _resolved(problem: Problem, few: Columns, many: Columns) -> np.ndarray:
+def _resolved(problem: Problem, blocks: np.ndarray, few: Columns, many: Columns) -> np.ndarray:
     """Weights (blocks, 1): 0 for pixels whose slopes along the scene's numbers need more samples.
 
     Where a silhouette runs through a pixel its slopes are those of few samples next to the edge:
@@ -964,12 +1232,12 @@ def _resolved(problem: Problem, few: Columns, many: Columns) -> np.ndarray:
         for slopes in (many.values, many.values - few.values)
     )
     typical = np.sqrt(np.mean(values**2))
-    wide = np.pad(
-        (changes > UNRESOLVED * np.maximum(values, typical)).reshape(film.height, film.width), 1
-    )
+    some = np.zeros(film.height * film.width, bool)
+    some[blocks] = changes > UNRESOLVED * np.maximum(values, typical)
+    wide = np.pad(some.reshape(film.height, film.width), 1)
     rows = wide[:-2] | wide[1:-1] | wide[2:]
     unsure = rows[:, :-2] | rows[:, 1:-1] | rows[:, 2:]
-    return np.where(unsure, 0.0, 1.0).reshape(-1, 1)
+    return np.where(unsure, 0.0, 1.0).reshape(-1, 1)[blocks]
 
 
 def _starts(problem: Problem, level: Level, most: int) -> list[Point]:
@@ -983,6 +1251,9 @@ def _starts(problem: Problem, level: Level, most: int) -> list[Point]:
     table = _index_table(problem, level)
     waves, weights, columns = _few_wavelengths(film)
     target = level.target[:, columns]
+    over = np.zeros(target.shape, bool)
+    if level.clipped is not None:
+        over = level.clipped.where[:, columns]
     found: list[tuple[float, float, Point]] = []
     for z in _variants(unknowns, waves):
         index = np.asarray(unknowns.coefficients.index(z, waves))
@@ -993,10 +1264,12 @@ def _starts(problem: Problem, level: Level, most: int) -> list[Point]:
         part = (place - left)[:, None, None]
         seen = table[left] * (1 - part) + table[left + 1] * part
         picture = np.einsum("jpc,jcd->pd", seen, weights, optimize=True)
-        others = _exposed(problem.free, picture, target, columns)
+        others = _exposed(problem.free, picture, target, columns, level.weights * ~over)
         gains, black = problem.free.exposure(others)
         some = gains[columns] if problem.free.gains else gains
-        cost = float(np.sum((some * picture + black - target) ** 2))
+        residual = some * picture + black - target
+        residual[over] = np.minimum(residual[over], 0.0)
+        cost = float(np.sum(level.weights * residual**2))
         found.append((cost, float(np.mean(index)), Point(z, others)))
     found.sort(key=lambda entry: entry[0])
     chosen: list[tuple[float, float, Point]] = []
@@ -1009,7 +1282,11 @@ def _starts(problem: Problem, level: Level, most: int) -> list[Point]:
 
 
 def _exposed(
-    free: Free, picture: np.ndarray, target: np.ndarray, columns: np.ndarray
+    free: Free,
+    picture: np.ndarray,
+    target: np.ndarray,
+    columns: np.ndarray,
+    weights: np.ndarray,
 ) -> np.ndarray:
     """Coordinates of the others: the scene's as they are, and the exposure that fits best.
 
@@ -1018,16 +1295,19 @@ def _exposed(
         picture: (blocks, d) some channels of a render.
         target: (blocks, d) of the target.
         columns: (d,) their numbers; between them gains are interpolated.
+        weights: (blocks, d) of their squared residuals.
     """
     others = np.zeros(free.total)
-    squares, sums = np.sum(picture**2, axis=0) + 1e-300, np.sum(picture, axis=0)
-    products, missing = np.sum(picture * target, axis=0), np.sum(target - picture)
-    black = missing / picture.size
+    squares, sums = (np.sum(weights * picture**power, axis=0) for power in (2, 1))
+    squares = squares + 1e-300
+    products, seen = np.sum(weights * picture * target, axis=0), np.sum(weights * target)
+    black = (seen - np.sum(sums)) / max(np.sum(weights), 1e-300)
     if free.gains:
-        rest = picture.size - np.sum(sums**2 / squares)
-        black = (np.sum(target) - np.sum(sums * products / squares)) / max(rest, 1e-300)
+        rest = np.sum(weights) - np.sum(sums**2 / squares)
+        black = (seen - np.sum(sums * products / squares)) / max(rest, 1e-300)
         black *= free.blacks
         gains = np.log(np.clip((products - black * sums) / squares, 1e-3, 1e3))
+        gains = np.where(np.any(weights > 0, axis=0), gains, 0.0)
         start = len(free.parameters)
         others[start : start + free.gains] = np.interp(np.arange(free.gains), columns, gains)
     if free.blacks:
@@ -1044,7 +1324,7 @@ def _index_table(problem: Problem, level: Level) -> np.ndarray:
     spectrum = Spectrum(np.full(len(INDEX_GRID), middle), None, None)
     size, run = film_size(problem.film), run_numbers(plan, level.seed, 1e-3)
     edge = int(part.chunks.size)
-    chunks, place = some_blocks(part.rows, problem.film.width // edge, float(edge), 4)
+    chunks, place = some_blocks(level.blocks, problem.film.width // edge, float(edge), 4)
 
     def trace(chunks: Pixels) -> np.ndarray:
         return np.asarray(
@@ -1113,34 +1393,100 @@ def _variants(unknowns: Unknowns, waves: np.ndarray) -> list[np.ndarray]:
     return found
 
 
-def _fit(problem: Problem, target: Picture, prior: str, noise: float | None) -> FitResult:
+def _fit(
+    problem: Problem, target: Picture, prior: str, noise: float | None, check: str | None
+) -> FitResult:
+    """The result of a search, or of as much of it as there was time for."""
+    stopped = False
+    try:
+        level, best = _search(problem, target)
+    except (KeyboardInterrupt, StopFit):
+        if not problem.kept:
+            raise
+        ((level, best),), stopped = problem.kept, True
+    said = {"samples": target.samples, "depth": target.depth, "seed": target.seed}
+    if level.name != LAST:
+        said = {}
+    own = ", ".join(f"{name} {value}" for name, value in said.items() if value is not None)
+    result = _result(problem, best, level, prior, noise, own, stopped)
+    if check is None or stopped or best.lin.seen == 0:
+        return result
+    return replace(result, check=_resampled(problem, level, best, noise, result.n_d_std))
+
+
+def _resampled(
+    problem: Problem, level: Level, end: Descent, given: float | None, reported: float
+) -> Resampled:
+    """The spread of n_d when the last step is repeated with other noise.
+
+    The misfits of the fit, their signs turned at random: so their sizes stay where they are, as in
+    the sandwich. But those of all channels of a square of pixels are turned together: where
+    neighbours or channels err alike, which the sandwich does not know, the spread is larger than
+    the error reported. A clean picture shows no noise, and gets as much as its errors refer to.
+
+    Source:
+        Liu, Ann. Stat. 16 (1988) 1696, the wild bootstrap; Cameron, Gelbach and Miller, Rev. Econ.
+        Stat. 90 (2008) 414, that of clusters.
+    """
+    lin, generator = end.lin, np.random.default_rng(0)
+    brightest = float(np.max(np.abs(problem.target)))
+    meat, _, _ = _noise(lin, given, brightest)
+    width = problem.film.width
+    y, x = np.divmod(level.blocks, width)
+    square = (y // TOGETHER) * (width // TOGETHER + 1) + x // TOGETHER
+    clean = lin.noise < CLEAN * brightest
+    held, anything = (_root(part) for part in (lin.held, meat))
+    found = []
+    for _ in range(REPEATS):
+        normal = generator.normal(size=len(lin.q))
+        if clean:
+            other = anything @ normal
+        else:
+            signs = generator.choice([-1.0, 1.0], np.max(square) + 1)[square]
+            other = lin.pulled(lin.pulls * signs[:, None]) + held @ normal
+        noisy = lin._replace(q=lin.q + other)
+        at, _ = _next_point(problem.unknowns, end.at, end.anchor, noisy, 0.0)
+        found.append(_n_d(problem.unknowns, at.z))
+    spread = float(np.std(found, ddof=1))
+    return Resampled(REPEATS, spread, spread / reported)
+
+
+def _root(covariance: np.ndarray) -> np.ndarray:
+    """A matrix that turns numbers of variance 1 into such with a covariance."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def _search(problem: Problem, target: Picture) -> "tuple[Level, Descent]":
     """Coarse to fine: the best of several starts, then the whole picture, then its final form."""
     film, depth, seed = problem.film, target.depth or 50, target.seed or 0
     coarse = max(1, -(-max(film.width, film.height) // COARSE_PIXELS))
-    level = _level(problem, coarse, FEW_SAMPLES, depth, seed)
+    level = _level(problem, COARSE, coarse, FEW_SAMPLES, depth, seed)
     ends = [_descend(problem, level, at, CUTOFF, 8, 1.0) for at in _starts(problem, level, 3)]
     best = min(ends, key=lambda end: end.lin.cost)
     along = None
     if target.samples is None:
-        level = _level(problem, 1, FEW_SAMPLES, depth, seed)
-        many = _level(problem, 1, FEW_SAMPLES, depth, seed, SPLITS[0])
+        level = _level(problem, FEW, 1, FEW_SAMPLES, depth, seed)
+        many = _level(problem, LAST, 1, FEW_SAMPLES, depth, seed, SPLITS[0])
         best = _descend(problem, level, best.at, CUTOFF, 20, 1.0)
         level, at = _refined(problem, best, many, depth)
         along = many if problem.free.parameters else None
     else:
-        level, at = _level(problem, 1, target.samples, depth, seed), best.at
+        level, at = _level(problem, LAST, 1, target.samples, depth, seed), best.at
     best = _descend(problem, level, at, CUTOFF, 30, LINEAR_STEP, along)
     if problem.free.parameters and best.converged:
         polished = _descend(problem, level, best.at, CUTOFF, POLISH, SMALL_STEP, along)
         best = polished._replace(steps=best.steps + polished.steps, converged=True)
+    if level.robust is not None:
+        level = level._replace(robust=Robust("tukey", best.spread))
+        cut = _descend(problem, level, best.at, CUTOFF, 30, LINEAR_STEP, along)
+        best = cut._replace(steps=best.steps + cut.steps)
     error = best.lin.noise / max(float(np.max(np.abs(best.lin.eliminated().r))), 1e-300)
     if NEGLECTED * CUTOFF > SMALL_STEP * error:
         # So clean a picture shows the light of the paths that were ended early.
         exact = _descend(problem, level, best.at, 0.0, 30, SMALL_STEP, along)
         best = exact._replace(steps=best.steps + exact.steps)
-    said = {"samples": target.samples, "depth": target.depth, "seed": target.seed}
-    own = ", ".join(f"{name} {value}" for name, value in said.items() if value is not None)
-    return _result(problem, best, level, prior, noise, own)
+    return level, best
 
 
 def _result(
@@ -1150,11 +1496,15 @@ def _result(
     prior: str,
     given: float | None,
     own: str,
+    stopped: bool,
 ) -> FitResult:
     """The result in the words of the glass, with its errors."""
     unknowns, lin, film, free = problem.unknowns, end.lin, problem.film, problem.free
     z = jnp.asarray(end.at.z)
     meat, noise, source = _noise(lin, given, float(np.max(np.abs(problem.target))))
+    if given is not None and level.robust is not None and meat is not lin.meat:
+        # A robust loss pays a little information, and outliers take some.
+        meat = meat * (max(lin.noise, given) / given) ** 2
     if free.names:
         source += f", and with {' and '.join(free.names)} free"
     whole = _covariance(unknowns, z, lin, meat, noise)
@@ -1177,8 +1527,16 @@ def _result(
     determined = int(np.sum(singular > 1 / DETERMINED))
     glass = Sellmeier(B, C, object_glass(problem.scene, problem.number).validity)
     converged, message = _verdict(end)
+    if stopped:
+        converged, message = False, f"stopped in step {end.steps} of {level.name}"
     left, within = lin.eliminated(), meat[free.total :, free.total :]
+    named, other = _named(unknowns, end.at.z, left, within)
     scene = _with_others(problem, end.at.others)
+    clipped = int(np.sum(problem.target >= problem.ceiling))
+    outliers = 0
+    if end.spread and level.robust is not None:
+        off = _weighed(level, lin) > end.spread * level.robust.cut
+        outliers = int(np.sum(off))
     return FitResult(
         scene=with_glass(scene, problem.number, glass),
         glass=glass,
@@ -1203,15 +1561,48 @@ def _result(
         singular_values=singular,
         determined=determined,
         summary=_summary(waves, n_std, determined, len(singular), source, prior, own)
-        + (UNDERSTATED if free.parameters else ""),
+        + _clipped_words(clipped, problem.ceiling)
+        + _outlier_words(outliers)
+        + (UNDERSTATED if free.parameters else "")
+        + (UNFINISHED if stopped else ""),
         rms_residual=lin.rms,
-        nearest_glasses=_nearest(unknowns, end.at.z, left, within),
+        nearest_glasses=tuple((name, distance) for name, distance, _ in named[:5]),
         prior=prior,
         noise=given,
         samples=tuple(part.plan.samples * part.split**2 for part in level.parts),
-        picture=lin.picture.reshape(problem.target.shape),
+        picture=_whole_picture(problem, level, end, stopped),
         free=tuple(_free_values(free, scene, end.at.others, np.sqrt(np.diag(whole)))),
+        used=None if problem.used.all() else problem.used,
+        clipped=clipped,
+        loss=problem.loss,
+        outliers=outliers,
+        probabilities=tuple(probability for _, _, probability in named[:5]),
+        other_probability=other,
+        stopped=stopped,
     )
+
+
+def _whole_picture(problem: Problem, level: Level, end: Descent, stopped: bool) -> np.ndarray:
+    """The render (height, width, channels) where a fit ended; of what a mask left out too.
+
+    Who stops a fit does not want to wait for that.
+    """
+    size, film = level.size, problem.film
+    width, height = film.width // size, film.height // size
+    blocks = np.zeros((height * width, film.channels))
+    blocks[level.blocks] = end.lin.picture
+    if size > 1:
+        wide = blocks.reshape(height, width, -1).repeat(size, axis=0).repeat(size, axis=1)
+        beyond = (0, film.height - height * size), (0, film.width - width * size), (0, 0)
+        return np.pad(wide, beyond, mode="edge")
+    rest = np.flatnonzero(~problem.used)
+    if len(rest) and not stopped:
+        like, (gains, black) = level.parts[0], problem.free.exposure(end.at.others)
+        own = np.arange(len(rest))
+        part = _part(problem, 1, like.plan.samples, like.plan.depth, rest, own, like.split)
+        traced = _trace(problem, part, end.at, level.seed, CUTOFF, False)
+        blocks[rest] = traced[:, 0] * gains + black
+    return blocks.reshape(problem.target.shape)
 
 
 def _with_others(problem: Problem, others: np.ndarray) -> Scene:
@@ -1329,20 +1720,61 @@ def _verdict(end: Descent) -> tuple[bool, str]:
     return True, f"a minimum was reached in {end.steps} steps"
 
 
-def _nearest(
+def _named(
     unknowns: Unknowns, z: np.ndarray, left: Eliminated, meat: np.ndarray
-) -> tuple[tuple[str, float], ...]:
-    """The five nearest glasses of the table, in standard deviations of what the picture tells."""
+) -> tuple[list[tuple[str, float, float]], float]:
+    """The glasses of the table, nearest first, and the probability that it is none of them.
+
+    Returns:
+        Names, distances in standard deviations of what the picture tells, and probabilities; and
+        that of any other glass.
+    """
     fitted = np.asarray(unknowns.coefficients.index(z, unknowns.reference))
     low, high = float(unknowns.coefficients.low), float(unknowns.coefficients.high)
-    spread = np.linalg.pinv(meat, hermitian=True)
-    found = []
-    for name, glass in glass_table().items():
-        if domain_error(glass, low, high):
-            continue
-        off = left.r @ unknowns.project @ (np.asarray(glass.indices(unknowns.reference)) - fitted)
-        found.append((name, float(np.sqrt(max(off @ spread @ off, 0.0)))))
-    return tuple(sorted(found, key=lambda entry: entry[1])[:5])
+    values, vectors = np.linalg.eigh(np.linalg.pinv(meat, hermitian=True))
+    whiten = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T @ left.r @ unknowns.project
+    table = {
+        name: whiten @ (np.asarray(glass.indices(unknowns.reference)) - fitted)
+        for name, glass in glass_table().items()
+        if not domain_error(glass, low, high)
+    }
+    if not table:
+        return [], 1.0
+    probabilities, other = _probabilities(np.stack(list(table.values())))
+    distances = (float(np.linalg.norm(off)) for off in table.values())
+    found = zip(table, distances, probabilities.tolist(), strict=True)
+    return sorted(found, key=lambda entry: entry[1]), other
+
+
+def _probabilities(
+    offsets: Float[np.ndarray, "glasses k"],
+) -> tuple[Float[np.ndarray, " glasses"], float]:
+    """The probability of each glass, and that it is another one.
+
+    Each glass of the table is as likely beforehand as any other, and one that is not in it as
+    likely as all of them together. What is not in it is spread as the table is: normally, with its
+    mean and covariance. So another glass explains any picture a little, the less the better the
+    picture tells glasses apart.
+
+    Args:
+        offsets: of each glass from the fit, in coordinates in which the error is 1 in every
+            direction.
+
+    Source:
+        MacKay, Information Theory, Inference, and Learning Algorithms (Cambridge, 2003), ch. 28.
+    """
+    count, k = offsets.shape
+    mean, spread = offsets.mean(axis=0), np.eye(k)
+    if count > 1:
+        spread = spread + np.atleast_2d(np.cov(offsets.T))
+    _, size = np.linalg.slogdet(spread)
+    logs = np.append(
+        -np.sum(offsets**2, axis=1) / 2 - np.log(count),
+        -(mean @ np.linalg.solve(spread, mean) + size) / 2,
+    )
+    likely = np.exp(logs - np.max(logs))
+    likely /= np.sum(likely)
+    return likely[:-1], float(likely[-1])
 
 
 def _summary(
@@ -1369,3 +1801,19 @@ def _summary(
     if own:
         text += f" The last level used what the picture says of itself: {own}."
     return text
+
+
+def _clipped_words(count: int, ceiling: float) -> str:
+    """How many values were cut off, if any."""
+    if not count:
+        return ""
+    values = "1 value of the target is" if count == 1 else f"{count} values of the target are"
+    return f" {values} clipped: known to be at least {ceiling:.3g}, and no more."
+
+
+def _outlier_words(count: int) -> str:
+    """How many values a robust loss left out, if any."""
+    if not count:
+        return ""
+    values = "1 value of the target is an outlier" if count == 1 else f"{count} values are outliers"
+    return f" {values}, and left out by the robust loss."

@@ -14,7 +14,7 @@ from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from diffdisp.color import bands_to_rgb, check_visible, decode_srgb, encode_srgb
 from diffdisp.film import Film
@@ -62,10 +62,12 @@ class Picture:
         samples: samples per pixel, if known.
         depth: most segments of a path, if known.
         seed: seed of the random numbers, if known.
+        ceiling: where values were cut off: one of at least this says no more than that the
+            radiance is at least this. None: nowhere. A .png tells it; no file keeps it.
 
     Raises:
         ValueError: radiance of other than three axes, of no pixels, or whose last axis disagrees
-            with the wavelengths; wavelengths that are not finite and positive.
+            with the wavelengths; wavelengths or a ceiling that are not finite and positive.
     """
 
     # The shapes are checked below, always and in words: they come from files.
@@ -74,12 +76,15 @@ class Picture:
     samples: int | None = None
     depth: int | None = None
     seed: int | None = None
+    ceiling: float | None = None
 
     def __post_init__(self) -> None:
         """Refuse arrays that do not belong together."""
         shape = self.radiance.shape
         if len(shape) != 3 or 0 in shape:
             raise ValueError(f"radiance must be (height, width, channels); found {shape}")
+        if self.ceiling is not None and not (np.isfinite(self.ceiling) and self.ceiling > 0):
+            raise ValueError(f"ceiling must be positive and finite; found {self.ceiling:g}")
         if self.wavelengths is None:
             if shape[2] != 3:
                 raise ValueError(
@@ -190,7 +195,8 @@ def read_picture(path: str | Path) -> Picture:
 
     `.npz` files hold `radiance` (H, W, K or 3), row 0 on top, and `wavelength` (K,) in µm, absent
     for linear sRGB; optionally `samples`, `depth` and `seed`; other keys are ignored. The values
-    of a `.png` are decoded to linear sRGB. Negative radiance is legal: noise has it.
+    of a `.png` are decoded to linear sRGB, and its `ceiling` is told. Negative radiance is legal:
+    noise has it.
 
     Args:
         path: .npz, .png, .tiff, .tif or .exr.
@@ -203,11 +209,7 @@ def read_picture(path: str | Path) -> Picture:
             disagree; the message names the file and what was found.
         ImportError: a package that the format takes is not installed.
     """
-    suffix = _suffix(path)
-    _extra_module(SUFFIX_MODULES[suffix], path)
-    if not Path(path).is_file():
-        raise ValueError(f"{path}: there is no such file")
-    try:
+    with _readable(path) as suffix:
         match suffix:
             case ".npz":
                 fields = _read_npz(Path(path))
@@ -218,12 +220,54 @@ def read_picture(path: str | Path) -> Picture:
             case _:
                 fields = _read_tiff(Path(path))
         return _picture(fields)
+
+
+@contextlib.contextmanager
+def _readable(path: str | Path) -> Iterator[str]:
+    """The suffix of a picture; what goes wrong while it is read is told of the file."""
+    suffix = _suffix(path)
+    _extra_module(SUFFIX_MODULES[suffix], path)
+    if not Path(path).is_file():
+        raise ValueError(f"{path}: there is no such file")
+    try:
+        yield suffix
     except ImportError:
         raise
     # Each decoder has its own kinds of error for a damaged file, some of them undocumented.
     except Exception as error:
         reason = str(error) or type(error).__name__
         raise ValueError(f"{path}: cannot be read as a {suffix} picture: {reason}") from error
+
+
+def read_mask(path: str | Path) -> Bool[np.ndarray, "height width"]:
+    """Read which pixels a picture marks: those with a channel that is not zero.
+
+    Args:
+        path: .npz with `mask` (height, width), or any picture that `read_picture` reads; a .tiff of
+            whole numbers too.
+
+    Raises:
+        ValueError: as `read_picture`.
+        ImportError: as `read_picture`.
+    """
+    with _readable(path) as suffix:
+        match suffix:
+            case ".npz":
+                fields = _read_npz(Path(path), "mask")
+            case ".png":
+                fields = _read_png(Path(path))
+            case ".exr":
+                fields = _read_exr(Path(path))
+            case _:
+                fields = _tiff_fields(Path(path))
+        values = np.asarray(fields.get("mask", fields.get("radiance")))
+        if values.dtype.kind not in "fiub" or not np.isfinite(values).all():
+            raise ValueError(f"a mask must be finite numbers; found {values.dtype}")
+        marked = values != 0
+        marked = np.any(marked, axis=-1) if marked.ndim == 3 else marked
+        if marked.ndim != 2 or 0 in marked.shape:
+            raise ValueError(f"a mask must be (height, width); found {values.shape}")
+        return marked
 
 
 def _picture(fields: Mapping[str, Any]) -> Picture:
@@ -236,7 +280,7 @@ def _picture(fields: Mapping[str, Any]) -> Picture:
     if "wavelength" in fields:
         wavelengths = _reals(fields, "wavelength").astype(np.float64)
     counts = {name: _whole(fields[name], name) for name in COUNTS if name in fields}
-    return Picture(radiance, wavelengths, **counts)
+    return Picture(radiance, wavelengths, ceiling=fields.get("ceiling"), **counts)
 
 
 def _fields(picture: Picture) -> dict[str, Any]:
@@ -283,15 +327,16 @@ def _described(description: Any) -> dict[str, Any]:
     return {key: found[key] for key in keys if key in found}
 
 
-def _read_npz(path: Path) -> dict[str, Any]:
+def _read_npz(path: Path, instead: str = "radiance") -> dict[str, Any]:
+    """The keys that are known, and `instead` of a radiance."""
     if not zipfile.is_zipfile(path):
         raise ValueError("it is no .npz archive")
     with np.load(path, allow_pickle=False) as archive:
-        known = ("radiance", "wavelength", *COUNTS)
+        known = ("radiance", "wavelength", *COUNTS, instead)
         # Only the known keys are read: the others may hold anything, also what cannot be read.
         found = {name: archive[name] for name in known if name in archive.files}
-        if "radiance" not in found:
-            raise ValueError(f"it has no radiance; found {sorted(archive.files) or 'nothing'}")
+        if not {"radiance", instead} & set(found):
+            raise ValueError(f"it has no {instead}; found {sorted(archive.files) or 'nothing'}")
         return found
 
 
@@ -320,8 +365,10 @@ def _read_png(path: Path) -> dict[str, Any]:
     else:
         # Greys and palettes become red, green, blue and opacity of 8 bits on the way.
         rgba = iio.imread(data, plugin="pillow", extension=".png", mode="RGBA", index=0)
-    encoded = _opaque(rgba / np.float64(np.iinfo(rgba.dtype).max))
-    return {"radiance": decode_srgb(encoded)}
+    levels = np.float64(np.iinfo(rgba.dtype).max)
+    # The top code stands for all that is rounded to it, and for all that is brighter.
+    ceiling = float(decode_srgb(np.array((levels - 0.5) / levels)))
+    return {"radiance": decode_srgb(_opaque(rgba / levels)), "ceiling": ceiling}
 
 
 def _decode_png16(data: bytes, path: Path) -> np.ndarray:
@@ -353,6 +400,15 @@ def _write_tiff(path: Path, picture: Picture) -> None:
 
 
 def _read_tiff(path: Path) -> dict[str, Any]:
+    fields = _tiff_fields(path)
+    if fields["radiance"].dtype.kind != "f":
+        # Whether whole numbers are linear or encoded is a guess; in a PNG it is not.
+        raise ValueError(f"its values must be floating-point; found {fields['radiance'].dtype}")
+    return fields
+
+
+def _tiff_fields(path: Path) -> dict[str, Any]:
+    """The keys of a .tiff file, its values as they are."""
     with _extra_module("tifffile", path).TiffFile(path) as file:
         if len(file.pages) != 1:
             raise ValueError(f"it has {len(file.pages)} pages, not one")
@@ -360,9 +416,6 @@ def _read_tiff(path: Path) -> dict[str, Any]:
         values, fields = page.asarray(), _described(page.description)
         if page.axes.startswith("S"):
             values = np.moveaxis(values, 0, -1)
-    if values.dtype.kind != "f":
-        # Whether whole numbers are linear or encoded is a guess; in a PNG it is not.
-        raise ValueError(f"its values must be floating-point; found {values.dtype}")
     if values.ndim == 2 and "wavelength" in fields:
         values = values[..., None]
     return {**fields, "radiance": values}

@@ -5,6 +5,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from diffdisp.misfit import Clipped, Misfit, Robust, misfit
+
+LEAST_SLOPE = 0.1
+"""Mean slope of a robust loss at which nine tenths of all misfits would be outliers: no less."""
+
 
 class Columns(NamedTuple):
     """The derivatives of a picture: a Jacobian of which each channel holds few columns.
@@ -53,6 +58,8 @@ class Linearised(NamedTuple):
         explained: part of the variance of what depends on the index that the render explains.
         columns: J.
         picture: the render.
+        score: picture minus target; of clipped values what they tell of it.
+        pulls: what each value adds to the slope of the cost: Jᵀ pulls = Rᵀ q, J without weights.
     """
 
     r: Float[np.ndarray, "total total"]
@@ -67,6 +74,8 @@ class Linearised(NamedTuple):
     explained: float
     columns: Columns
     picture: Float[np.ndarray, "blocks channels"]
+    score: Float[np.ndarray, "blocks channels"]
+    pulls: Float[np.ndarray, "blocks channels"]
 
     @property
     def weight(self) -> np.ndarray:
@@ -80,6 +89,13 @@ class Linearised(NamedTuple):
         rms = self.rms * np.sqrt(cost / self.cost) if self.cost > 0 else 0.0
         picture = self.picture + self.columns.along(change)
         return self._replace(q=q, cost=cost, rms=float(rms), picture=picture)
+
+    def pulled(self, pulls: np.ndarray) -> np.ndarray:
+        """What q (total,) would be if these were the pulls (blocks, channels)."""
+        slope = np.zeros(self.columns.total)
+        each = np.einsum("cbk,bc->ck", self.columns.values, pulls)
+        np.add.at(slope, self.columns.unknown, each)
+        return np.linalg.solve(self.r.T, slope)
 
     def eliminated(self, damping: float = 0.0) -> "Eliminated":
         """What is left for the index when the others take their best values.
@@ -130,6 +146,8 @@ def linearise(
     columns: Columns,
     weights: Float[np.ndarray, "blocks 1"],
     widest: float,
+    clipped: Clipped | None = None,
+    robust: Robust | None = None,
 ) -> Linearised:
     """A picture and its derivatives, reduced to what a step needs.
 
@@ -139,24 +157,45 @@ def linearise(
         columns: its derivatives.
         weights: of each block's squared residuals, within [0, 1].
         widest: standard deviation of an other of which the picture says nothing, in its unit.
+        clipped: values of the target that were cut off, if any.
+        robust: what takes the place of squares, if anything. Residuals are then what pulls of
+            each, over the mean slope of that pull: a step, q and meat are those of the
+            M-estimate, and only `picture`, `score` and `rms` know the outliers as they are.
+
+    Source:
+        Huber, Robust Statistics (Wiley, 1981): modified residuals, section 7.8; the covariance of
+        an M-estimate, section 7.6, here without equal variances.
     """
-    plain, root = picture - target, np.sqrt(weights)
-    residual = plain * root
+    plain = picture - target
+    told = Misfit(plain, plain, np.ones_like(plain), plain**2)
+    if clipped is not None:
+        told = misfit(picture, target, clipped)
+    root = np.sqrt(weights * told.curvature)
+    residual, score = root * told.residual, np.sqrt(weights) * told.score
+    cost, pull = weights * told.cost, np.ones_like(plain)
+    if robust is not None:
+        pull, slope, height = robust.influence(score)
+        cost = cost * height
+        # Where the index shows most, the slopes of the pulls count most.
+        count = np.max(np.abs(columns.of_index), axis=-1).T ** 2 * weights * told.curvature
+        mean = float(np.sum(slope * count) / max(np.sum(count), 1e-300))
+        residual, score = (pull / max(mean, LEAST_SLOPE) * off for off in (residual, score))
     seen = np.any(columns.of_index != 0, axis=-1).T
     count, total = int(seen.sum()), columns.total
-    effective = float(np.sum(seen * weights))
-    noise = float(np.sqrt(np.sum(residual[seen] ** 2) / max(effective - total, 1.0)))
+    effective = float(np.sum(seen * weights * told.curvature))
+    noise = float(np.sqrt(np.sum(score[seen] ** 2) / max(effective - total, 1.0)))
     contrast = np.sum((target[seen] - np.mean(target[seen])) ** 2) if count else 1.0
-    explained = 1 - float(np.sum(plain[seen] ** 2)) / max(float(contrast), 1e-300)
+    explained = 1 - float(np.sum((pull * told.score)[seen] ** 2)) / max(float(contrast), 1e-300)
     near = max(noise, 1e-9 * float(np.max(np.abs(target), initial=1e-300))) / widest
     # Each channel by itself, and then their triangles: most unknowns are of one channel alone.
-    basis, triangles = _qr(columns.values * root)
+    basis, triangles = _qr(columns.values * root.T[..., None])
     errors = residual.T
     q = np.einsum("cbk,cb->ck", basis, errors)
     meat, white = (
         np.einsum("cbk,cb,cbl->ckl", basis, squares, basis, optimize=True)
         for squares in (errors**2, np.broadcast_to(weights.T, errors.shape))
     )
+    # The variance of a clipped value's score is its curvature: the two are of one likelihood.
     channels, width = q.shape
     rows = np.zeros((channels * width + columns.others, total))
     within, without = (np.zeros((len(rows), len(rows))) for _ in range(2))
@@ -175,13 +214,15 @@ def linearise(
         whole.T @ within @ whole + held,
         whole.T @ without @ whole,
         held,
-        float(np.sum(residual**2)),
+        float(np.sum(cost)),
         count,
         noise,
-        float(np.sqrt(np.mean(plain**2))),
+        float(np.sqrt(np.mean(told.score**2))),
         explained,
         columns,
         picture,
+        told.score,
+        root * residual,
     )
 
 

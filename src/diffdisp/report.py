@@ -17,12 +17,15 @@ from matplotlib.figure import Figure
 
 from diffdisp.color import encode_srgb
 from diffdisp.dispersion import Sellmeier
-from diffdisp.fitting import FitResult
+from diffdisp.fitting import FitResult, Resampled
 from diffdisp.glasses import named_glass
 from diffdisp.image import Picture, linear_rgb, replacing
 
 UNDETERMINED = 0.1
 """Relative standard error of a coefficient from which on the picture does not determine it."""
+
+LEAST_PROBABILITY = 5e-4
+"""What the table shows of a probability is rounded to 0.001."""
 
 PLOT_LIMITS = (0.1, 50.0)
 """Wavelengths that a plot of a glass shows at most, µm."""
@@ -49,6 +52,7 @@ def fit_json(result: FitResult) -> dict[str, Any]:
         "prior": result.prior,
         "converged": bool(result.converged),
         "message": result.message,
+        "stopped": bool(result.stopped),
         "steps": int(result.steps),
         "B": _plain(result.B),
         "C": _plain(result.C),
@@ -68,15 +72,31 @@ def fit_json(result: FitResult) -> dict[str, Any]:
         "determined": int(result.determined),
         "summary": result.summary,
         "rms_residual": _plain(result.rms_residual),
-        "nearest_glasses": [
-            {"name": name, "distance": _plain(distance)}
-            for name, distance in result.nearest_glasses
-        ],
+        "loss": result.loss,
+        "left_out": {
+            "masked_pixels": result.masked,
+            "clipped_values": result.clipped,
+            "outlying_values": result.outliers,
+        },
+        "nearest_glasses": list(_nearest_entries(result)),
+        "other_glass_probability": _plain(result.other_probability),
+        "check": None if result.check is None else _plain_check(result.check),
         "free": [
             {"name": name, "value": _plain(value), "std": _plain(std)}
             for name, value, std in result.free
         ],
     }
+
+
+def _plain_check(check: Resampled) -> dict[str, Any]:
+    return {name: _plain(value) for name, value in check._asdict().items()}
+
+
+def _nearest_entries(result: FitResult) -> Iterator[dict[str, Any]]:
+    """Name, distance and, where it is known, probability of each near glass."""
+    for i, (name, distance) in enumerate(result.nearest_glasses):
+        known = [("probability", _plain(p)) for p in result.probabilities[i : i + 1]]
+        yield {"name": name, "distance": _plain(distance), **dict(known)}
 
 
 def write_fit_json(path: str | os.PathLike[str], result: FitResult) -> None:
@@ -109,7 +129,7 @@ def result_table(result: FitResult) -> str:
     """
     rows = [
         ("object", result.object_name or "(unnamed)"),
-        ("converged", f"{'yes' if result.converged else 'NO'}, {_steps(result.steps)}"),
+        ("converged", f"{'yes' if result.converged else 'NO'}, {_count(result.steps, 'step')}"),
         *([] if result.converged else [("message", result.message)]),
         ("prior", result.prior),
         ("n_d", _with_error(result.n_d, result.n_d_std)),
@@ -119,15 +139,18 @@ def result_table(result: FitResult) -> str:
         *_free_rows(result),
         ("determined", f"{result.determined} of {len(result.singular_values)} directions"),
         ("nearest", _nearest(result)),
+        *([("glass", _probable(result))] if result.probabilities else []),
         ("residual", f"{result.rms_residual:.3g} rms"),
+        *([("check", _checked(result.check))] if result.check else []),
+        *([("left out", f"{_count(result.masked, 'pixel')} by the mask")] if result.masked else []),
     ]
     width = max([11, *(len(value.name) + 2 for value in result.free)])
     table = "\n".join(f"{name:<{width}}{text}" for name, text in rows)
     return f"{table}\n\n{textwrap.fill(result.summary, 79)}"
 
 
-def _steps(count: int) -> str:
-    return f"{count} step" if count == 1 else f"{count} steps"
+def _count(number: int, thing: str) -> str:
+    return f"{number} {thing}{'' if number == 1 else 's'}"
 
 
 def _coefficient_rows(result: FitResult) -> Iterator[tuple[str, str]]:
@@ -178,6 +201,20 @@ def _nearest(result: FitResult) -> str:
     )
 
 
+def _checked(check: Resampled) -> str:
+    """What resampling found."""
+    margin = check.ratio / math.sqrt(2 * (check.repeats - 1))
+    return f"resampled n_d spreads {check.ratio:.2f} ± {margin:.2f} times its error"
+
+
+def _probable(result: FitResult) -> str:
+    """The catalogue glasses that it may be, with their probabilities."""
+    names = [name for name, _ in result.nearest_glasses]
+    each = zip(names, result.probabilities, strict=False)
+    shown = [f"{name} {p:.3f}" for name, p in each if p >= LEAST_PROBABILITY]
+    return ", ".join([*shown[:3], f"none of the table {result.other_probability:.3f}"])
+
+
 # The fit as a page of plots.
 
 
@@ -212,11 +249,15 @@ def _draw_pictures(axes: list[Axes], result: FitResult, target: Picture) -> None
         axis.imshow(picture, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
         axis.set_title(f"{title} ({seen_as})")
     residual = np.mean(np.asarray(result.picture, np.float64) - target.radiance, axis=-1)
-    limit = float(np.percentile(np.abs(residual), 99.5)) or float(np.abs(residual).max()) or 1.0
+    told = residual if result.used is None else residual[result.used]
+    limit = float(np.percentile(np.abs(told), 99.5)) or float(np.abs(told).max()) or 1.0
+    if result.used is not None:
+        residual = np.where(result.used, residual, np.nan)
+        axes[2].set_facecolor("0.6")
     drawn = axes[2].imshow(
         residual, cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest"
     )
-    axes[2].set_title("residual (fit − target)")
+    axes[2].set_title(f"residual (fit − target){'' if result.used is None else ', grey: masked'}")
     bar = axes[2].figure.colorbar(drawn, ax=axes[2], extend="both", shrink=0.9)
     bar.set_label(f"radiance, mean over {_channels(target)}")
     bar.formatter.set_powerlimits((-2, 3))  # type: ignore[attr-defined]
@@ -245,7 +286,7 @@ def _displayed(
         light, exposed_for = radiance[..., middle], target.radiance[..., middle]
         seen_as = f"{target.wavelengths[middle] * 1e3:.4g} nm"
     # A few glints may saturate; the picture behind them should not be dark.
-    white = float(np.percentile(exposed_for, 99))
+    white = float(np.nanpercentile(exposed_for, 99))
     return encode_srgb(np.asarray(light, np.float64) / (white if white > 0 else 1.0)), seen_as
 
 
