@@ -30,6 +30,7 @@ ORDER = (
     "rendering",
     "linearised",
     "fitting",
+    "varying",
     "scene_file",
     "report",
     "__main__",
