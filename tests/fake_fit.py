@@ -1,11 +1,11 @@
-"""A fit's result without a fit."""
+"""A fit's result without a fit, and what to expect of one without a render."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 
 from diffdisp.camera import Camera
-from diffdisp.fitting import FitResult
+from diffdisp.fitting import FitResult, Uncertainty
 from diffdisp.geometry import Sphere
 from diffdisp.glasses import glass_table, named_glass
 from diffdisp.image import Picture
@@ -78,3 +78,9 @@ def fake_result(wavelengths: np.ndarray = BANDS, channels: int = 16, **changes) 
         picture=blurred_ring(32, channels),
     )
     return replace(result, **changes)
+
+
+def fake_expected(**changes) -> Uncertainty:
+    """What to expect, as of the fake fit."""
+    result = fake_result(noise=1e-3, **changes)
+    return Uncertainty(**{each.name: getattr(result, each.name) for each in fields(Uncertainty)})

@@ -31,6 +31,7 @@ ORDER = (
     "misfit",
     "linearised",
     "fitting",
+    "varying",
     "scene_file",
     "report",
     "__main__",

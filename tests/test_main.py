@@ -15,7 +15,7 @@ import imageio.v3 as iio
 import jax
 import numpy as np
 import pytest
-from fake_fit import fake_result
+from fake_fit import fake_expected, fake_result
 
 from diffdisp import __main__ as command_line
 from diffdisp import fitting
@@ -242,6 +242,8 @@ def test_bad_option(scene, out, capsys, options, phrase):
         ("render . -o a.png", "cannot be read"),
         ("fit scene.toml", "required"),
         ("fit nosuch.toml nosuch.npz -o a", "nosuch.toml"),
+        ("plan-fit scene.toml -o a", "--noise"),
+        ("plan-fit nosuch.toml --noise 1e-3 -o a", "nosuch.toml"),
         ("glass", "GLASS"),
         ("glass N-BK77", "similar are"),
         ("glass nosuch.yml", "nosuch.yml: No such file"),
@@ -347,6 +349,39 @@ def test_bad_mask(scene, target, tmp_path, out, capsys, keys, phrase):
     refused(capsys, [*arguments, str(tmp_path / "nosuch.png")], "nosuch.png: there is no such")
     refused(capsys, [*arguments, str(tmp_path / "mask.txt")], "a picture ends in one of")
     assert list(out.iterdir()) == []
+
+
+# Bad plans: the scene, options, and what the message must say.
+BAD_PLANS = {
+    **{
+        name: BAD_FITS[name]
+        for name in ("no glass", "two balls", "not glass", "no such object", "nothing of that name")
+    },
+    **{name: BAD_FITS[name] for name in ("unknown prior", "no noise", "noise not finite")},
+    "nothing to see": (SCENE.replace("center = [0, 0, 0]", "center = [0, 0, 9]"), "", "no pixel"),
+    "pole at low": (own_glass("[1, 0, 0]", "[0.25, 0, 0]"), "--bands 500:700:2", "pole at 500"),
+    "pole in colour": (own_glass("[1, 0, 0]", "[0.25, 0, 0]"), "", "pole at 500"),
+    "bands reversed": (SCENE, "--bands 700:400:4", "must rise"),
+    "size 0": (SCENE, "--size 0x4", "at least 1"),
+    "size beyond memory": (SCENE, "--size 9999999x9999999", "not enough memory"),
+    "bands beyond memory": (SCENE, "--bands 400:700:2000000000", "not enough memory"),
+    "a target": (SCENE, "target.npz", "target.npz"),
+}
+
+
+@pytest.mark.parametrize(("text", "options", "phrase"), BAD_PLANS.values(), ids=BAD_PLANS)
+def test_bad_plan(tmp_path, out, capsys, text, options, phrase):
+    (tmp_path / "bad.toml").write_text(text, encoding="utf-8")
+    arguments = ["plan-fit", str(tmp_path / "bad.toml"), "--noise", "1e-3", "--size", "6x4"]
+    arguments += ["-o", str(out / "plan"), *options.split()]
+    refused(capsys, arguments, phrase)
+    assert list(out.iterdir()) == []
+
+
+def test_a_plan_whose_folder_cannot_be_written(scene, out, capsys):
+    (out / "plan.json").mkdir()
+    plan = ["plan-fit", scene, "--noise", "1e-3", "-o", str(out)]
+    refused(capsys, plan, "plan.json: is a folder")
 
 
 @pytest.mark.parametrize(
@@ -773,6 +808,69 @@ def test_ctrl_c_before_a_fit_has_a_point(scene, target, out, capsys, monkeypatch
     assert list(out.iterdir()) == []
 
 
+# What to expect of a fit.
+
+
+@pytest.fixture
+def expected(monkeypatch):
+    """What was asked of each bench; the error of n_d falls with the picture's width."""
+    asked = []
+
+    def expect(scene, film, **options):
+        asked.append((scene, film, options))
+        return fake_expected(n_d_std=1e-4 / film.width)
+
+    monkeypatch.setattr("diffdisp.varying.expected_uncertainty", expect)
+    return asked
+
+
+def test_plan_fit_prints(scene, out, monkeypatch, capsys, expected):
+    monkeypatch.chdir(out)
+    assert main(["plan-fit", scene, "--noise", "2e-3"]) == 0
+    told = capsys.readouterr()
+    assert told.err == ""
+    assert "picture    96 x 96 pixels, colour\n" in told.out
+    assert "n_d        1.5168049 ± 0.0000010\n" in told.out
+    assert "determined 3 of 6 directions" in told.out
+    assert "one by one are not determined" in told.out
+    assert "Best" not in told.out
+    assert list(out.iterdir()) == []
+    ((_, film, options),) = expected
+    assert film.wavelengths is None
+    assert options == {"noise": 2e-3, "object_name": None, "free": [], "prior": "none"}
+
+
+def test_plan_fit_draws(scene, out, capsys, expected):
+    folder = out / "deep" / "plan"
+    options = ["--size", "40x30", "--bands", "400:700:8", "--object", "ball"]
+    options += ["--free", "gain", "--free", "ball.center", "--prior", "fixed-c3"]
+    assert main(["plan-fit", scene, "--noise", "1e-3", "-o", str(folder), *options]) == 0
+    told = capsys.readouterr()
+    assert told.err == ""
+    assert "width of the picture: 80 pixels instead of 40; σ of n_d 1.3e-06" in told.out
+    assert "number of bands: 8, as it is" in told.out
+    assert {file.name for file in folder.iterdir()} == {"plan.json", "plan.png"}
+    plan = json.loads((folder / "plan.json").read_text(encoding="utf-8"))
+    assert [len(some["values"]) for some in plan["variations"]] == [5, 5, 5, 5]
+    assert plan["size"] == [40, 30]
+    assert iio.imread(folder / "plan.png").std() > 5
+    assert len(expected) == 17
+    for _, _, asked in expected:
+        assert asked["object_name"] == "ball"
+        assert asked["free"] == ["gain", "ball.center"]
+        assert (asked["noise"], asked["prior"]) == (1e-3, "fixed-c3")
+
+
+def test_ctrl_c_while_planning(scene, out, capsys, monkeypatch):
+    def interrupted(*_args, **_options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("diffdisp.varying.expected_uncertainty", interrupted)
+    assert main(["plan-fit", scene, "--noise", "1e-3", "-o", str(out / "plan")]) == 130
+    assert capsys.readouterr() == ("", "diffdisp: interrupted, nothing written\n")
+    assert list(out.iterdir()) == []
+
+
 # The process.
 
 
@@ -831,7 +929,7 @@ def test_choices_are_those_of_the_fit():
 
 
 def test_help_and_version(capsys):
-    for command in ([], ["render"], ["fit"], ["glass"]):
+    for command in ([], ["render"], ["fit"], ["plan-fit"], ["glass"]):
         assert main([*command, "--help"]) == 0
         assert "usage: diffdisp" in capsys.readouterr().out
     assert main(["--version"]) == 0

@@ -4,19 +4,25 @@ import warnings
 import imageio.v3 as iio
 import numpy as np
 import pytest
-from fake_fit import BANDS, blurred_ring, fake_result, fake_target
+from fake_fit import BANDS, blurred_ring, fake_expected, fake_result, fake_target
 
 from diffdisp.dispersion import Sellmeier
+from diffdisp.film import Film
 from diffdisp.fitting import FreeValue, Resampled
 from diffdisp.glasses import named_glass
 from diffdisp.image import Picture
 from diffdisp.report import (
+    bench_json,
+    bench_table,
     fit_json,
     result_table,
+    write_bench_json,
+    write_bench_plot,
     write_fit_json,
     write_glass_plot,
     write_report,
 )
+from diffdisp.varying import Bench, Variation
 
 KEYS = {
     *("converged", "message", "steps", "B", "C", "B_std", "C_std", "covariance", "n_d"),
@@ -258,3 +264,63 @@ def test_plots_that_cannot_be_written(tmp_path, name, message):
     with pytest.raises(ValueError, match=message):
         write_glass_plot(tmp_path / name, named_glass("N-BK7"))
     assert list(tmp_path.iterdir()) == []
+
+
+# --- what to expect of a bench
+
+
+def fake_bench(count: int = 4) -> Bench:
+    """A bench whose tiles are best as they are, and whose pictures had better be large."""
+    values, errors = np.array([0.25, 0.5, 1.0]), np.array([5e-6, 3.2e-6, 6e-6])
+    variations = (
+        Variation("tile width", "scene units", 0.5, values, errors, errors * 1e4),
+        Variation("width of the picture", "pixels", 32.0, 64 * values, 2e-4 * values, values, 2),
+        Variation("number of bands", "", 8.0, 16 * values, errors[::-1], errors, 1),
+        Variation("distance", "scene units", 0.5, values[1:2], errors[1:2], errors[1:2]),
+    )
+    film = Film(32, 32, BANDS)
+    return Bench(fake_expected(), film, variations[:count], ("a screen: there is none",))
+
+
+def test_what_to_expect_as_a_table():
+    table = bench_table(fake_bench())
+    assert table.startswith("object     ball\npicture    32 x 32 pixels, 16 bands\n")
+    assert "noise      0.001 in each value\n" in table
+    for line in result_table(fake_result()).split("\n"):
+        # All that a fit says of the glass and its errors is said of one to come as well.
+        if not line.startswith(("converged", "nearest", "residual")):
+            assert f"{line}\n" in table
+    assert "  tile width: 0.5 scene units, as it is\n" in table
+    assert "  width of the picture: 16 pixels instead of 32; σ of n_d 5e-05 instead of " in table
+    assert "  number of bands: 8, as it is\n" in table
+    assert table.endswith("Left out: a screen: there is none.")
+    assert "Best" not in bench_table(fake_bench(0))
+
+
+def test_what_to_expect_as_json(tmp_path):
+    write_bench_json(tmp_path / "plan.json", fake_bench())
+    read = json.loads((tmp_path / "plan.json").read_text(encoding="utf-8"))
+    of_fits_alone = {"converged", "message", "steps", "rms_residual", "nearest_glasses"}
+    own = {"noise", "size", "variations", "left_out"}
+    assert read.keys() == (KEYS - of_fits_alone) | own == bench_json(fake_bench()).keys()
+    assert read["variations"][0] == {
+        "quantity": "tile width",
+        "unit": "scene units",
+        "own": 0.5,
+        "values": [0.25, 0.5, 1.0],
+        "n_d_std": [5e-6, 3.2e-6, 6e-6],
+        "V_d_std": pytest.approx([0.05, 0.032, 0.06]),
+        "best": 0.5,
+    }
+    assert (read["noise"], read["size"]) == (1e-3, [32, 32])
+    assert [file.name for file in tmp_path.iterdir()] == ["plan.json"]
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4])
+def test_variations_are_drawn(tmp_path, count):
+    write_bench_plot(tmp_path / "plan.png", fake_bench(count))
+    width, height = size_of(tmp_path / "plan.png")
+    assert width > 1000
+    assert height > (400 if count < 3 else 800)
+    with pytest.raises(ValueError, match=r"found '\.doc'"):
+        write_bench_plot(tmp_path / "plan.doc", fake_bench(count))

@@ -12,7 +12,15 @@ if TYPE_CHECKING:
     from diffdisp.color import encode_srgb
     from diffdisp.dispersion import Sellmeier
     from diffdisp.film import Film, band_middles
-    from diffdisp.fitting import FitResult, FreeValue, Resampled, StopFit, fit
+    from diffdisp.fitting import (
+        FitResult,
+        FreeValue,
+        Resampled,
+        StopFit,
+        Uncertainty,
+        expected_uncertainty,
+        fit,
+    )
     from diffdisp.geometry import Plane, Sphere
     from diffdisp.glasses import glass_source, glass_table, load_glass, named_glass
     from diffdisp.image import Picture, linear_rgb, read_picture, write_picture
@@ -47,8 +55,10 @@ __all__ = [
     "Solid",
     "Sphere",
     "StopFit",
+    "Uncertainty",
     "band_middles",
     "encode_srgb",
+    "expected_uncertainty",
     "fit",
     "glass_source",
     "glass_table",
@@ -73,7 +83,15 @@ _NAMES = {
     "color": ("encode_srgb",),
     "dispersion": ("Sellmeier",),
     "film": ("Film", "band_middles"),
-    "fitting": ("FitResult", "FreeValue", "Resampled", "StopFit", "fit"),
+    "fitting": (
+        "FitResult",
+        "FreeValue",
+        "Resampled",
+        "StopFit",
+        "Uncertainty",
+        "expected_uncertainty",
+        "fit",
+    ),
     "geometry": ("Plane", "Sphere"),
     "glasses": ("glass_source", "glass_table", "load_glass", "named_glass"),
     "image": ("Picture", "linear_rgb", "read_picture", "write_picture"),

@@ -21,6 +21,11 @@ DONE, BAD_INPUT, NOT_CONVERGED, INTERRUPTED = 0, 2, 3, 130
 PRIORS, LOSSES = ("none", "catalogue", "fixed-c3"), ("squares", "robust")
 """Those of `fitting`, which is too heavy to be asked."""
 
+PLAN_SIZE = (96, 96)
+"""Pixels of a picture that is only thought of: a few seconds a bench."""
+PLAN_COLUMNS = 8
+"""Pictures that its slopes are: six, of a colour picture, and those along what else is free."""
+
 QUALITY = {"draft": 4, "standard": 16, "reference": 256}
 """Samples per pixel of each preset."""
 
@@ -136,6 +141,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     _add_render(commands.add_parser("render", help="draw a scene"))
     _add_fit(commands.add_parser("fit", help="recover the glass of a ball from a picture"))
+    _add_plan_fit(commands.add_parser("plan-fit", help="what a picture of a scene would tell"))
     _add_glass(commands.add_parser("glass", help="print what is known of a glass"))
     return parser
 
@@ -189,6 +195,27 @@ _FREE_HELP = (
     "screen.point, screen.tile, camera.vertical_fov, ...; gain, a factor for each band; black, "
     "a level added to all. May be given several times"
 )
+
+
+def _add_plan_fit(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Say what a picture of the scene would tell of its glass ball, before it is taken; with "
+        "-o also how that changes with the screen's distance and tiles, with the picture's size "
+        "and with the number of bands."
+    )
+    parser.set_defaults(run=_plan_fit)
+    add = parser.add_argument
+    add("scene", metavar="SCENE", help="a scene file, .toml, with the glass to expect")
+    add("--noise", type=_noise, required=True, metavar="SIGMA", help="of the radiance")
+    add("-o", dest="output", metavar="DIR", help="for plan.json and plan.png")
+    add("--size", type=_size, default=PLAN_SIZE, metavar="WxH", help="pixels (default 96x96)")
+    add("--bands", type=_bands, metavar="LOW:HIGH:COUNT", help=_BANDS_HELP)
+    add("--object", metavar="NAME", help="the ball, where the scene has several of glass")
+    add("--free", action="append", default=[], metavar="NAME", help=_PLAN_FREE_HELP)
+    add("--prior", choices=PRIORS, default="none", help="what is known beforehand (default none)")
+
+
+_PLAN_FREE_HELP = "would be fitted too, as in fit; may be given several times"
 
 
 def _add_glass(parser: argparse.ArgumentParser) -> None:
@@ -382,7 +409,7 @@ def _timed(
 def _fit(options: argparse.Namespace) -> int:
     """`diffdisp fit`."""
     folder = Path(options.output)
-    _check_folder(folder)
+    _check_folder(folder, ("fit.json", "report.png"))
     from diffdisp.fitting import fit
     from diffdisp.glasses import load_glass
     from diffdisp.image import read_mask, read_picture
@@ -419,6 +446,43 @@ def _fit(options: argparse.Namespace) -> int:
     if result.stopped:
         return _complain(f"interrupted: {folder} holds the fit so far", INTERRUPTED)
     return DONE if result.converged else NOT_CONVERGED
+
+
+def _plan_fit(options: argparse.Namespace) -> int:
+    """`diffdisp plan-fit`."""
+    if options.output:
+        folder = Path(options.output)
+        _check_folder(folder, ("plan.json", "plan.png"))
+    from diffdisp.report import bench_table, write_bench_json, write_bench_plot
+    from diffdisp.scene_file import load_scene
+    from diffdisp.varying import FACTORS, vary_bench
+
+    scene = load_scene(options.scene)
+    width, height = options.size
+    channels, most = options.bands[2] if options.bands else 3, max(FACTORS)
+    _check_memory(int(most * width), int(most * height), PLAN_COLUMNS * channels, 1, 8)
+    _check_glasses(scene, options.bands)
+    _keep_compiled()
+    ask = partial(
+        vary_bench,
+        scene,
+        options.size,
+        options.bands,
+        noise=options.noise,
+        object_name=options.object,
+        free=options.free,
+        prior=options.prior,
+        only_own=not options.output,
+    )
+    with _progress_bar("planning", "bench") as bar:
+        _advance(bar, 0, 1)
+        bench = ask(progress=lambda done, total: _advance(bar, done, total))
+    if options.output:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_bench_plot(folder / "plan.png", bench)
+        write_bench_json(folder / "plan.json", bench)
+    print(bench_table(bench))
+    return DONE
 
 
 def _glass(options: argparse.Namespace) -> int:
@@ -509,8 +573,8 @@ def _available_memory() -> int:
     return min(limits)
 
 
-def _check_folder(folder: Path) -> None:
-    """Raise now what making a folder and writing into it would raise after a long fit.
+def _check_folder(folder: Path, names: tuple[str, ...]) -> None:
+    """Raise now what making a folder and writing files of some names would raise after a long fit.
 
     Raises:
         ValueError: something on the way is no folder, or may not be written to.
@@ -520,7 +584,7 @@ def _check_folder(folder: Path) -> None:
         raise ValueError(f"{folder}: {nearest} is no folder")
     if not os.access(nearest, os.W_OK | os.X_OK):
         raise ValueError(f"{folder}: the folder {nearest} may not be written to")
-    for name in ("fit.json", "report.png"):
+    for name in names:
         if (folder / name).is_dir():
             raise ValueError(f"{folder / name}: is a folder")
 

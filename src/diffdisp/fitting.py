@@ -64,13 +64,17 @@ COARSE_PIXELS = 32
 FEW_SAMPLES = 4
 """Film samples per pixel on the way to the last level."""
 
-SPLITS = (2, 4)
+SPLITS = (2, 4, 10)
 """Into how many parts each way the last level splits a pixel, where the target does not say its own
-samples: most pixels, and those that more samples change most. With `FEW_SAMPLES` in each part that
-is 16 and 64 samples a pixel, by one program."""
+samples: most pixels, those that more samples change most, and those of them that need still more.
+With `FEW_SAMPLES` in each part that is 16, 64 and 400 samples a pixel, by one program."""
 
-REFINED = 0.5
-"""Part of the pixels that show the ball that get the more samples."""
+REFINED = (0.5, 0.15)
+"""Parts of the pixels that show the ball that get the more samples, and the most of them."""
+
+TOLERATED = 0.1
+"""Part of the noise that an error of a pixel may be without the most samples: next to its rim the
+bench's ball is at 64 samples a pixel as far off as a noise of 1 %."""
 
 DETERMINED = 0.1
 """A direction of log B, log C counts as determined when its standard deviation is below this."""
@@ -96,11 +100,6 @@ the next one is far below a tenth of the noise: 2.5 times, then 0.06 measured on
 
 SMALL_STEP = 0.1
 """A step that changes the picture by less than this part of its noise ends the fit."""
-
-UNRESOLVED = 0.5
-"""A pixel whose slopes along the scene's numbers change by more than this part with four times as
-many samples says nothing of them. On the bench at 48 pixels that leaves out the outermost 8 % of
-the radius: errors grow by half, and gains and black levels come out unbiased."""
 
 UNDERSTATED = (
     " With numbers of the scene free these errors are too small, by a factor of two or more: the"
@@ -183,6 +182,60 @@ class FreeValue(NamedTuple):
     name: str
     value: float
     std: float
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """How well a picture tells a glass.
+
+    Args:
+        object_name: name of the ball made of it.
+        B: (3,) dimensionless.
+        C: (3,) µm².
+        B_std: (3,) one standard deviation; 0 where held fixed.
+        C_std: (3,) one standard deviation, µm².
+        covariance: (6, 6) of B1 B2 B3 C1 C2 C3.
+        n_d: index at the d line.
+        n_d_std: one standard deviation.
+        V_d: Abbe number.
+        V_d_std: one standard deviation.
+        P_gF: relative partial dispersion.
+        P_gF_std: one standard deviation.
+        wavelengths: (K,) µm, of `n`.
+        n: (K,) index.
+        n_std: (K,) one standard deviation.
+        singular_values: of the Jacobian in log B, log C over the noise: one over the standard
+            deviation of each direction.
+        determined: how many of them are known to better than 0.1.
+        summary: the same in a sentence.
+        prior: "none", "catalogue" or "fixed-c3".
+        noise: standard deviation of the picture's values, as given.
+        samples: film samples per pixel: of most pixels, of the hardest.
+        free: what else is free.
+    """
+
+    object_name: str
+    B: np.ndarray
+    C: np.ndarray
+    B_std: np.ndarray
+    C_std: np.ndarray
+    covariance: np.ndarray
+    n_d: float
+    n_d_std: float
+    V_d: float
+    V_d_std: float
+    P_gF: float
+    P_gF_std: float
+    wavelengths: np.ndarray
+    n: np.ndarray
+    n_std: np.ndarray
+    singular_values: np.ndarray
+    determined: int
+    summary: str
+    prior: str
+    noise: float
+    samples: tuple[int, ...]
+    free: tuple[FreeValue, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -548,15 +601,12 @@ def fit(
             in `free` that the scene does not have; a mask of another size, or that leaves
             nothing; values that are used and not finite.
     """
-    if prior not in PRIORS:
-        raise ValueError(f"prior {prior!r}: allowed are {', '.join(PRIORS)}")
+    _check_known(prior, noise)
     if loss not in LOSSES:
         raise ValueError(f"loss {loss!r}: allowed are {', '.join(LOSSES)}")
     if check is not None and check not in CHECKS:
         raise ValueError(f"check {check!r}: allowed are {', '.join(CHECKS)}")
-    if noise is not None and not (np.isfinite(noise) and noise > 0):
-        raise ValueError(f"noise {noise}: must be a finite number above 0")
-    number = _glass_object(scene, object_name)
+    number = glass_object(scene, object_name)
     if start is not None:
         scene = with_glass(scene, number, start)
     check_glasses(scene, *film_range(target.film))
@@ -583,12 +633,99 @@ def _used(target: Picture, mask: np.ndarray | None) -> np.ndarray:
     return used
 
 
+def expected_uncertainty(
+    scene: Scene,
+    film: Film,
+    *,
+    noise: float,
+    object_name: str | None = None,
+    free: Sequence[str] = (),
+    prior: str = "none",
+) -> Uncertainty:
+    """What a picture of a scene would tell of a glass ball, before anybody takes it; in float64.
+
+    The errors that `fit` would report of such a picture, if it found the scene's own glass: the
+    picture and its slopes there are those of its last level. What so many samples leave open of
+    each pixel counts as noise too; where that is more than the noise, fits report up to 1.6 times
+    these errors (measured on the bench at 32 pixels and a noise of 1e-3; at 64 pixels 1.0).
+
+    Args:
+        scene: what the picture is to show; the ball's glass in it is what is looked at.
+        film: size and bands of the picture.
+        noise: standard deviation of its values, the same in all, in units of radiance.
+        object_name: the ball, where the scene has several of glass.
+        free: what else is not known well and would be fitted, as in `fit`.
+        prior: as in `fit`.
+
+    Returns:
+        The scene's glass, and its errors.
+
+    Raises:
+        ValueError: as of `fit`; a ball that no pixel of the picture depends on.
+
+    Source:
+        Kay, Fundamentals of Statistical Signal Processing: Estimation Theory (Prentice Hall,
+        1993), sections 3.5 and 3.7: the bound of Cramér and Rao for a signal in white noise, from
+        the signal's slopes alone.
+    """
+    _check_known(prior, noise)
+    number = glass_object(scene, object_name)
+    check_glasses(scene, *film_range(film))
+    bands = None if film.wavelengths is None else np.asarray(film.wavelengths)
+    blank = Picture(np.zeros((film.height, film.width, film.channels)), bands)
+    used = np.ones((film.height, film.width), bool)
+    with jax.enable_x64(True):
+        problem = _problem(scene, number, blank, used, free, prior, LOSSES[0], _silent)
+        return _expected(problem, prior, noise)
+
+
+def _expected(problem: Problem, prior: str, noise: float) -> Uncertainty:
+    """The last level of a fit to the picture that the scene itself makes."""
+    at = Point(problem.unknowns.coefficients.start(), np.zeros(problem.free.total))
+    few = _linearise(problem, _level(problem, FEW, 1, FEW_SAMPLES, 50, 0), at, CUTOFF)
+    if few.seen == 0:
+        raise ValueError("no pixel of such a picture depends on this glass")
+    brightest = float(np.max(np.abs(few.picture))) or 1.0
+    problem = problem._replace(free=problem.free._replace(brightest=brightest))
+    many = _level(problem, LAST, 1, FEW_SAMPLES, 50, 0, SPLITS[0])
+    some = _linearise(problem, many, at, CUTOFF)
+    level = _more_samples(problem, many, few, some, 50, noise)
+    seen = _linearise(problem, level, at, CUTOFF, some.columns)
+    # A pixel's weight says how much of its residual is what samples leave open, beside the noise:
+    # all residuals, weighed, are to be as large as the noise.
+    residual = noise / np.sqrt(np.where(level.weights > 0, level.weights, 1.0))
+    lin = linearise(seen.picture, seen.picture + residual, seen.columns, level.weights, WIDEST)
+    expected, source = _noise(lin, noise, brightest), f"at a noise of {noise:g}"
+    if expected.sigma > noise:
+        source += f", with what samples leave open as of {expected.sigma:.2g}"
+    expected = expected._replace(source=source)
+    opening = "Such a picture would fix"
+    known = _uncertainty(problem, at, level, lin, expected, prior, opening)
+    return replace(known, noise=noise)
+
+
+def _check_known(prior: str, noise: float | None) -> None:
+    """Refuse what cannot be known beforehand.
+
+    Raises:
+        ValueError: an unknown prior; a noise that is not positive.
+    """
+    if prior not in PRIORS:
+        raise ValueError(f"prior {prior!r}: allowed are {', '.join(PRIORS)}")
+    if noise is not None and not (np.isfinite(noise) and noise > 0):
+        raise ValueError(f"noise {noise}: must be a finite number above 0")
+
+
 def _silent(step: int, rms: float, n_d: float) -> None:
     """No progress wanted."""
 
 
-def _glass_object(scene: Scene, name: str | None) -> int:
-    """Number of the glass ball called `name`, or of the only one."""
+def glass_object(scene: Scene, name: str | None) -> int:
+    """Number of the glass ball called `name`, or of the only one.
+
+    Raises:
+        ValueError: there is none, or several and no name.
+    """
     glasses = [i for i, obj in enumerate(scene.objects) if is_glass(obj)]
     if not glasses:
         raise ValueError("the scene has no glass ball to fit")
@@ -809,7 +946,9 @@ def _traced(
             return chunk_lanes(plan, changed, spectrum, size, pixels, run)
 
         def of_scene(coordinates: Array) -> Array:
-            return combine(plan, followed_radiance(plan, at(index), lanes(coordinates)), spectrum)
+            # A ball's outline moves with it; slopes of points of it are far from a pixel's.
+            soft = replace(plan, soft=not plan.nested and not plan.scattering)
+            return combine(soft, followed_radiance(soft, at(index), lanes(coordinates)), spectrum)
 
         def of_index(index: Array) -> Array:
             return combine(plan, lane_radiance(plan, at(index), lanes(coordinates)), spectrum)
@@ -1168,6 +1307,29 @@ def _n_d(unknowns: Unknowns, z: np.ndarray) -> float:
 def _refined(problem: Problem, few: Descent, level: Level, depth: int) -> tuple[Level, Point]:
     """A whole picture with samples as `SPLITS` says, and the point to go on from.
 
+    Args:
+        problem: what stays the same.
+        few: where the steps on a whole picture of few samples ended.
+        level: the whole picture with as many samples as most pixels get.
+        depth: segments of a path.
+    """
+    some = _linearise(problem, level, few.at, CUTOFF)
+    at, _ = _next_point(problem.unknowns, few.at, few.at.z, some, 0.0)
+    residual = np.abs(some.score)[some.weight > 0]
+    shown = _deviation(residual, np.ones_like(residual))
+    return _more_samples(problem, level, few.lin, some, depth, shown), at
+
+
+def _more_samples(
+    problem: Problem,
+    level: Level,
+    few: Linearised,
+    some: Linearised,
+    depth: int,
+    noise: float,
+) -> Level:
+    """A whole picture with samples as `SPLITS` says, weighed by how well they draw each pixel.
+
     Near the rim a ball shows the whole scene within a few pixels, where footprints are neither
     small nor straight. The pixels that weigh most in the index and change most with the samples
     get more of them; and since what error is left falls about as the area of a footprint, a
@@ -1175,69 +1337,38 @@ def _refined(problem: Problem, few: Descent, level: Level, depth: int) -> tuple[
 
     Args:
         problem: what stays the same.
-        few: where the steps on a whole picture of few samples ended.
         level: the whole picture with as many samples as most pixels get.
+        few: the picture of few samples.
+        some: that of as many as most pixels get, at the same point.
         depth: segments of a path.
+        noise: of the target's values.
 
     Source:
         Richardson, Phil. Trans. A 210 (1911) 307, extrapolation to a step of zero.
     """
-    some = _linearise(problem, level, few.at, CUTOFF)
-    change = np.max(np.abs(some.picture - few.lin.picture) * some.weight, axis=1)
-    hard = np.zeros(len(change), bool)
-    hard[np.argsort(-change)[: int(np.sum(some.weight.any(axis=1)) * REFINED)]] = True
-    parts = tuple(
-        _part(
-            problem,
-            1,
-            FEW_SAMPLES,
-            depth,
-            level.blocks[which],
-            np.flatnonzero(which),
-            split,
-            share,
-        )
-        for which, split, share in (
-            (~hard, SPLITS[0], 1.0),
-            (hard, SPLITS[0], -1 / 3),
-            (hard, SPLITS[1], 4 / 3),
-        )
-        if which.any()
+    sigma = max(noise, CLEAN * problem.free.brightest)
+    change, seen = np.abs(some.picture - few.picture), int(np.sum(some.weight.any(axis=1)))
+    order = np.argsort(-np.max(change * some.weight, axis=1))
+    # What a quarter of the samples changes tells the error of these, and that of more.
+    error, hard = np.max(change, axis=1) / 3, np.zeros(len(change), bool)
+    hard[order[: int(seen * REFINED[0])]] = True
+    error[hard] *= (SPLITS[0] / SPLITS[1]) ** 2
+    hardest = hard & (error > TOLERATED * sigma)
+    hardest[order[np.cumsum(hardest[order]) > seen * REFINED[1]]] = False
+    error[hardest] *= (SPLITS[1] / SPLITS[2]) ** 2
+    parts = [(~hard, SPLITS[0], 1.0)]
+    for which, fewer, more in ((hard & ~hardest, *SPLITS[:2]), (hardest, *SPLITS[1:])):
+        ratio = (more / fewer) ** 2
+        parts += [(which, fewer, -1 / (ratio - 1)), (which, more, ratio / (ratio - 1))]
+    rows = [np.flatnonzero(which) for which, _, _ in parts]
+    return level._replace(
+        parts=tuple(
+            _part(problem, 1, FEW_SAMPLES, depth, level.blocks[row], row, split, share)
+            for row, (_, split, share) in zip(rows, parts, strict=True)
+            if len(row)
+        ),
+        weights=1 / (1 + (error[:, None] / sigma) ** 2),
     )
-    at, _ = _next_point(problem.unknowns, few.at, few.at.z, some, 0.0)
-    # What a quarter of the samples changes tells the error of these, and so what a residual tells.
-    error = np.max(np.abs(some.picture - few.lin.picture), axis=1, keepdims=True) / 3
-    error[hard] /= SPLITS[1] ** 2 / SPLITS[0] ** 2
-    residual = np.abs(some.score)[some.weight > 0]
-    shown = _deviation(residual, np.ones_like(residual))
-    sigma = max(shown, CLEAN * problem.free.brightest)
-    weights = 1 / (1 + (error / sigma) ** 2)
-    if problem.free.parameters:
-        weights *= _resolved(problem, level.blocks, few.lin.columns, some.columns)
-    return level._replace(parts=parts, weights=weights), at
-
-
-def _resolved(problem: Problem, blocks: np.ndarray, few: Columns, many: Columns) -> np.ndarray:
-    """Weights (blocks, 1): 0 for pixels whose slopes along the scene's numbers need more samples.
-
-    Where a silhouette runs through a pixel its slopes are those of few samples next to the edge:
-    steep, and far from the pixel's. There a picture would seem to tell much that it does not. The
-    neighbours of such pixels go with them: a silhouette may pass between the samples.
-    """
-    count, film = len(problem.free.parameters), problem.film
-    scale = np.linalg.norm(many.values[..., :count], axis=(0, 1))
-    at_all = np.where(scale > 0, scale, 1.0)
-    values, changes = (
-        np.linalg.norm(slopes[..., :count] / at_all, axis=(0, 2))
-        for slopes in (many.values, many.values - few.values)
-    )
-    typical = np.sqrt(np.mean(values**2))
-    some = np.zeros(film.height * film.width, bool)
-    some[blocks] = changes > UNRESOLVED * np.maximum(values, typical)
-    wide = np.pad(some.reshape(film.height, film.width), 1)
-    rows = wide[:-2] | wide[1:-1] | wide[2:]
-    unsure = rows[:, :-2] | rows[:, 1:-1] | rows[:, 2:]
-    return np.where(unsure, 0.0, 1.0).reshape(-1, 1)[blocks]
 
 
 def _starts(problem: Problem, level: Level, most: int) -> list[Point]:
@@ -1489,6 +1620,20 @@ def _search(problem: Problem, target: Picture) -> "tuple[Level, Descent]":
     return level, best
 
 
+class Noise(NamedTuple):
+    """The noise of a target.
+
+    Args:
+        meat: (total, total) how it enters q.
+        sigma: its standard deviation.
+        source: where both come from, in words.
+    """
+
+    meat: np.ndarray
+    sigma: float
+    source: str
+
+
 def _result(
     problem: Problem,
     end: Descent,
@@ -1499,15 +1644,95 @@ def _result(
     stopped: bool,
 ) -> FitResult:
     """The result in the words of the glass, with its errors."""
-    unknowns, lin, film, free = problem.unknowns, end.lin, problem.film, problem.free
-    z = jnp.asarray(end.at.z)
-    meat, noise, source = _noise(lin, given, float(np.max(np.abs(problem.target))))
-    if given is not None and level.robust is not None and meat is not lin.meat:
+    lin, total = end.lin, problem.free.total
+    noise = _noise(lin, given, float(np.max(np.abs(problem.target))))
+    if given is not None and level.robust is not None and noise.meat is not lin.meat:
         # A robust loss pays a little information, and outliers take some.
-        meat = meat * (max(lin.noise, given) / given) ** 2
+        noise = noise._replace(meat=noise.meat * (max(lin.noise, given) / given) ** 2)
+    known = _uncertainty(problem, end.at, level, lin, noise, prior, "This picture fixes", own)
+    glass = Sellmeier(known.B, known.C, object_glass(problem.scene, problem.number).validity)
+    converged, message = _verdict(end)
+    if stopped:
+        converged, message = False, f"stopped in step {end.steps} of {level.name}"
+    left, within = lin.eliminated(), noise.meat[total:, total:]
+    named, other = _named(problem.unknowns, end.at.z, left, within)
+    clipped = int(np.sum(problem.target >= problem.ceiling))
+    outliers = 0
+    if end.spread and level.robust is not None:
+        off = _weighed(level, lin) > end.spread * level.robust.cut
+        outliers = int(np.sum(off))
+    scene = _with_others(problem, end.at.others)
+    return FitResult(
+        scene=with_glass(scene, problem.number, glass),
+        glass=glass,
+        object_name=known.object_name,
+        converged=converged,
+        message=message,
+        steps=end.steps,
+        B=known.B,
+        C=known.C,
+        B_std=known.B_std,
+        C_std=known.C_std,
+        covariance=known.covariance,
+        n_d=known.n_d,
+        n_d_std=known.n_d_std,
+        V_d=known.V_d,
+        V_d_std=known.V_d_std,
+        P_gF=known.P_gF,
+        P_gF_std=known.P_gF_std,
+        wavelengths=known.wavelengths,
+        n=known.n,
+        n_std=known.n_std,
+        singular_values=known.singular_values,
+        determined=known.determined,
+        summary=known.summary
+        + _clipped_words(clipped, problem.ceiling)
+        + _outlier_words(outliers)
+        + (UNFINISHED if stopped else ""),
+        rms_residual=lin.rms,
+        nearest_glasses=tuple((name, distance) for name, distance, _ in named[:5]),
+        prior=prior,
+        noise=given,
+        samples=known.samples,
+        picture=_whole_picture(problem, level, end, stopped),
+        free=known.free,
+        used=None if problem.used.all() else problem.used,
+        clipped=clipped,
+        loss=problem.loss,
+        outliers=outliers,
+        probabilities=tuple(probability for _, _, probability in named[:5]),
+        other_probability=other,
+        stopped=stopped,
+    )
+
+
+def _uncertainty(
+    problem: Problem,
+    at: Point,
+    level: Level,
+    lin: Linearised,
+    noise: Noise,
+    prior: str,
+    opening: str,
+    own: str = "",
+) -> Uncertainty:
+    """What a picture linearised at a point tells of the glass, in the words of the glass.
+
+    Args:
+        problem: what stays the same.
+        at: the point.
+        level: the resolution.
+        lin: the picture there.
+        noise: of the target.
+        prior: what else is known.
+        opening: of the sentence, as in "This picture fixes".
+        own: what the target says of how it was drawn.
+    """
+    unknowns, film, free = problem.unknowns, problem.film, problem.free
+    z, source = jnp.asarray(at.z), noise.source
     if free.names:
         source += f", and with {' and '.join(free.names)} free"
-    whole = _covariance(unknowns, z, lin, meat, noise)
+    whole = _covariance(unknowns, z, lin, noise.meat, noise.sigma)
     covariance = whole[free.total :, free.total :]
     to_logs = jax.jacfwd(unknowns.coefficients.logarithms)(z)
 
@@ -1525,25 +1750,9 @@ def _result(
     singular = 1 / np.sqrt(np.linalg.eigvalsh(covariance))
     singular = np.sort(singular)[::-1]
     determined = int(np.sum(singular > 1 / DETERMINED))
-    glass = Sellmeier(B, C, object_glass(problem.scene, problem.number).validity)
-    converged, message = _verdict(end)
-    if stopped:
-        converged, message = False, f"stopped in step {end.steps} of {level.name}"
-    left, within = lin.eliminated(), meat[free.total :, free.total :]
-    named, other = _named(unknowns, end.at.z, left, within)
-    scene = _with_others(problem, end.at.others)
-    clipped = int(np.sum(problem.target >= problem.ceiling))
-    outliers = 0
-    if end.spread and level.robust is not None:
-        off = _weighed(level, lin) > end.spread * level.robust.cut
-        outliers = int(np.sum(off))
-    return FitResult(
-        scene=with_glass(scene, problem.number, glass),
-        glass=glass,
+    scene, errors = _with_others(problem, at.others), np.sqrt(np.diag(whole))
+    return Uncertainty(
         object_name=problem.scene.objects[problem.number].name,
-        converged=converged,
-        message=message,
-        steps=end.steps,
         B=B,
         C=C,
         B_std=std[:3],
@@ -1560,25 +1769,12 @@ def _result(
         n_std=n_std,
         singular_values=singular,
         determined=determined,
-        summary=_summary(waves, n_std, determined, len(singular), source, prior, own)
-        + _clipped_words(clipped, problem.ceiling)
-        + _outlier_words(outliers)
-        + (UNDERSTATED if free.parameters else "")
-        + (UNFINISHED if stopped else ""),
-        rms_residual=lin.rms,
-        nearest_glasses=tuple((name, distance) for name, distance, _ in named[:5]),
+        summary=_summary(opening, waves, n_std, determined, len(singular), source, prior, own)
+        + (UNDERSTATED if free.parameters else ""),
         prior=prior,
-        noise=given,
+        noise=noise.sigma,
         samples=tuple(part.plan.samples * part.split**2 for part in level.parts),
-        picture=_whole_picture(problem, level, end, stopped),
-        free=tuple(_free_values(free, scene, end.at.others, np.sqrt(np.diag(whole)))),
-        used=None if problem.used.all() else problem.used,
-        clipped=clipped,
-        loss=problem.loss,
-        outliers=outliers,
-        probabilities=tuple(probability for _, _, probability in named[:5]),
-        other_probability=other,
-        stopped=stopped,
+        free=tuple(_free_values(free, scene, at.others, errors)),
     )
 
 
@@ -1630,20 +1826,18 @@ def _free_values(
         yield FreeValue("black", black, float(free.brightest * errors[free.total - 1]))
 
 
-def _noise(lin: Linearised, given: float | None, brightest: float) -> tuple[np.ndarray, float, str]:
-    """How noise enters q (m, m), its standard deviation, and where both come from, in words."""
+def _noise(lin: Linearised, given: float | None, brightest: float) -> Noise:
+    """As given, as the residual shows it, or as assumed where it shows none."""
     if given is not None and lin.noise <= 1.1 * given:
-        return given**2 * lin.white + lin.held, given, f"at the given noise of {given:g}"
+        source = f"at the given noise of {given:g}"
+        return Noise(given**2 * lin.white + lin.held, given, source)
     if given is None and lin.noise < CLEAN * brightest:
-        return (
-            ASSUMED_NOISE**2 * lin.white + lin.held,
-            ASSUMED_NOISE,
-            f"the picture is clean; at an assumed noise of {ASSUMED_NOISE:g}",
-        )
+        source = f"the picture is clean; at an assumed noise of {ASSUMED_NOISE:g}"
+        return Noise(ASSUMED_NOISE**2 * lin.white + lin.held, ASSUMED_NOISE, source)
     source = f"at the noise of {lin.noise:.2g} estimated from the residual"
     if given is not None:
         source += f", more than the given {given:g}"
-    return lin.meat, lin.noise, source
+    return Noise(lin.meat, lin.noise, source)
 
 
 def _covariance(
@@ -1778,6 +1972,7 @@ def _probabilities(
 
 
 def _summary(
+    opening: str,
     waves: np.ndarray,
     n_std: np.ndarray,
     determined: int,
@@ -1789,7 +1984,7 @@ def _summary(
     """What the picture determines, in plain words."""
     known = f"{determined} of the {free} directions of (B, C)"
     text = (
-        f"This picture fixes n to {np.max(n_std):.1e} (1 sigma) between {waves.min() * 1e3:.0f}"
+        f"{opening} n to {np.max(n_std):.1e} (1 sigma) between {waves.min() * 1e3:.0f}"
         f" and {waves.max() * 1e3:.0f} nm and {known} to better than 10 %"
         f" ({source}{'' if prior == 'none' else f', with the prior {prior}'})."
     )

@@ -135,44 +135,29 @@ def mean_root(middle: Real, width: Real) -> Real:
     return jnp.where(whole, inside, cut)
 
 
-def ball_offset(
-    ray: Ray,
-    center: Vec3,
-    radius: Real,
-    width: Real,
-    nested: bool,
-    inside: Array | bool,
-) -> Vec3:
-    """From a ball's centre to where a ray meets it, if it is known to meet it next.
+def soft_offset(ray: Ray, center: Vec3, radius: Real, width: Real, inside: Array | bool) -> Vec3:
+    """From a ball's centre to where a footprint meets it, which moves smoothly at its outline too.
 
-    Next to its silhouette a ball turns away within less than a footprint. The point is then the
+    Next to its outline a ball turns away within less than a footprint. The point is then the
     mean of where the footprint meets the ball, and of where the part of it that passes beside
     the ball comes nearest: reflectance and directions are linear in the cosine so near to
-    grazing, so that what is seen from there is the mean of what is seen. It moves with the ball
-    as smoothly. It lies on the ray, and a little off the ball; the path then goes on as in a ball
-    on which it lies.
+    grazing, so that what is seen from there is about the mean of what is seen. It lies on the
+    ray, and a little off the ball; the path goes on as in a ball on which it lies.
 
     Args:
-        ray: the ray.
+        ray: the ray, from outside unless it begins on the ball.
         center: the ball's.
         radius: the ball's.
         width: of a box in which the depth of `sphere_depth` has the variance that it has over
             the footprint.
-        nested: whether the ray may begin inside of the ball though it is not known to.
         inside: whether the ray begins on the ball and goes through it.
     """
     to_origin = ray.origin - center
     along = -to_origin.dot(ray.direction)
-    across = to_origin + ray.direction * (2.0 * along)
-    if inside is True:
-        return across
     foot = to_origin + ray.direction * along
     depth = (radius * radius - foot.dot(foot)) / (radius * radius)
-    cosine = mean_root(depth, width)
-    if nested:
-        within = to_origin.dot(to_origin) < radius * radius
-        cosine = jnp.where(within, -safe_sqrt(depth, least_square(depth)), cosine)
-    return choose(inside, across, foot - ray.direction * (radius * cosine))
+    met = foot - ray.direction * (radius * mean_root(depth, width))
+    return choose(inside, to_origin + ray.direction * (2.0 * along), met)
 
 
 def plane_distance(ray: Ray, point: Vec3, normal: Vec3) -> Real:

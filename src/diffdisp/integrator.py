@@ -23,11 +23,11 @@ from diffdisp.geometry import (
     Plane,
     Ray,
     Sphere,
-    ball_offset,
     box_width,
     first_distance,
     plane_axes,
     plane_distance,
+    soft_offset,
     sphere_depth,
     sphere_distances,
 )
@@ -245,7 +245,7 @@ def nearest(
         last: number of the surface on which the ray starts, -1 for none. Its own distance of
             zero is divided out, so that no offset is needed to leave it.
         spheres: those that the ray can meet.
-        footprint: of the ray, where a part of it that meets a glass ball counts as meeting it.
+        footprint: of the ray; where balls are soft, a part of it that meets one counts as all.
     """
     ray, world, centers, radii, footprint = jax.lax.stop_gradient(
         (ray, world, spheres.centers, spheres.radii, footprint)
@@ -266,7 +266,7 @@ def nearest(
             center, radius = _pick_vector(centers, place), radii[place]
             number = spheres.numbers[place]
             distance, meets = first_distance(ray, center, radius, number == last)
-            if footprint is not None and plan.balls:
+            if footprint is not None and plan.soft:
                 along, depth, edges = sphere_depth(ray, footprint, center, radius)
                 grazes = (depth <= 0) & (depth + 0.5 * box_width(edges) > 0) & (along > 0)
                 grazes = grazes & (number < plan.balls) & (number != last)
@@ -815,11 +815,17 @@ def _parting(path: Path, setting: Setting, inside: Array | bool) -> tuple[Way, W
     def stage(of: Callable[[Any], Any], value: Any, *edges: Any) -> tuple[Any, Any]:
         return once(lambda: pushed(of, value, edges), setting.one)
 
-    width = box_width(sphere_depth(path.ray, path.footprint, center, radius)[2])
+    width = None
+    if plan.soft:
+        width = box_width(sphere_depth(path.ray, path.footprint, center, radius)[2])
 
     def meet(ray: Ray) -> tuple[Vec3, Vec3]:
-        offset = ball_offset(ray, center, radius, width, plan.nested, inside)
-        return offset, normalize(offset)
+        if width is not None:
+            offset = soft_offset(ray, center, radius, width, inside)
+            return offset, normalize(offset)
+        distance = _distance_to_ball(ray, center, radius, plan, inside)
+        outward = normalize(ray.origin + ray.direction * distance - center)
+        return outward * radius, outward
 
     old, changes = path.ray.direction, tuple(edge.direction for edge in path.footprint)
     (offset, outward), moves = stage(meet, path.ray, *path.footprint)
@@ -877,6 +883,18 @@ def _go_on(
     return kept._replace(
         radiance=radiance, alive=alive, spectral=moved.spectral, reflected=moved.reflected
     )
+
+
+def _distance_to_ball(
+    ray: Ray, center: Vec3, radius: Real, plan: Plan, inside: Array | bool
+) -> Real:
+    """Distance to the ball that the path is known to meet next."""
+    across = -2.0 * (ray.origin - center).dot(ray.direction)
+    if inside is True:
+        return across
+    near, far, _ = sphere_distances(ray, center, radius)
+    ahead = jnp.where(near > 0, near, far) if plan.nested else near
+    return choose(inside, across, ahead)
 
 
 class Scattered(NamedTuple):

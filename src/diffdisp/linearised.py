@@ -182,7 +182,8 @@ def linearise(
         residual, score = (pull / max(mean, LEAST_SLOPE) * off for off in (residual, score))
     seen = np.any(columns.of_index != 0, axis=-1).T
     count, total = int(seen.sum()), columns.total
-    effective = float(np.sum(seen * weights * told.curvature))
+    # A weight makes up for what is wrong with a value beside the noise: weighed, all have its size.
+    effective = float(np.sum(seen * (weights > 0) * told.curvature))
     noise = float(np.sqrt(np.sum(score[seen] ** 2) / max(effective - total, 1.0)))
     contrast = np.sum((target[seen] - np.mean(target[seen])) ** 2) if count else 1.0
     explained = 1 - float(np.sum((pull * told.score)[seen] ** 2)) / max(float(contrast), 1e-300)

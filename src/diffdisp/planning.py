@@ -45,6 +45,7 @@ class Plan:
         cubed: the same of a `Checker`, on any surface.
         fuzzy: whether any metal is not smooth.
         nested: whether anything, the camera too, may lie within or across a glass ball.
+        soft: whether a ball's outline is averaged over footprints, as what moves it asks for.
     """
 
     samples: int
@@ -63,6 +64,7 @@ class Plan:
     cubed: tuple[bool, bool]
     fuzzy: bool
     nested: bool
+    soft: bool = False
 
     @property
     def first_plane(self) -> int:

@@ -1,4 +1,4 @@
-"""What a fit found: as JSON, as a table, as a page of plots; and a plot of one glass."""
+"""What a fit found, and what to expect of one: as JSON, as a table, as plots; plots of a glass."""
 
 import json
 import math
@@ -14,12 +14,14 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
 
 from diffdisp.color import encode_srgb
 from diffdisp.dispersion import Sellmeier
-from diffdisp.fitting import FitResult, Resampled
+from diffdisp.fitting import FitResult, Resampled, Uncertainty
 from diffdisp.glasses import named_glass
 from diffdisp.image import Picture, linear_rgb, replacing
+from diffdisp.varying import Bench, Variation
 
 UNDETERMINED = 0.1
 """Relative standard error of a coefficient from which on the picture does not determine it."""
@@ -54,23 +56,7 @@ def fit_json(result: FitResult) -> dict[str, Any]:
         "message": result.message,
         "stopped": bool(result.stopped),
         "steps": int(result.steps),
-        "B": _plain(result.B),
-        "C": _plain(result.C),
-        "B_std": _plain(result.B_std),
-        "C_std": _plain(result.C_std),
-        "covariance": _plain(result.covariance),
-        "n_d": _plain(result.n_d),
-        "n_d_std": _plain(result.n_d_std),
-        "V_d": _plain(result.V_d),
-        "V_d_std": _plain(result.V_d_std),
-        "P_gF": _plain(result.P_gF),
-        "P_gF_std": _plain(result.P_gF_std),
-        "wavelength": _plain(result.wavelengths),
-        "n": _plain(result.n),
-        "n_std": _plain(result.n_std),
-        "singular_values": _plain(result.singular_values),
-        "determined": int(result.determined),
-        "summary": result.summary,
+        **_known_json(result),
         "rms_residual": _plain(result.rms_residual),
         "loss": result.loss,
         "left_out": {
@@ -81,9 +67,32 @@ def fit_json(result: FitResult) -> dict[str, Any]:
         "nearest_glasses": list(_nearest_entries(result)),
         "other_glass_probability": _plain(result.other_probability),
         "check": None if result.check is None else _plain_check(result.check),
+    }
+
+
+def _known_json(known: FitResult | Uncertainty) -> dict[str, Any]:
+    """What is known of the glass, or will be."""
+    return {
+        "B": _plain(known.B),
+        "C": _plain(known.C),
+        "B_std": _plain(known.B_std),
+        "C_std": _plain(known.C_std),
+        "covariance": _plain(known.covariance),
+        "n_d": _plain(known.n_d),
+        "n_d_std": _plain(known.n_d_std),
+        "V_d": _plain(known.V_d),
+        "V_d_std": _plain(known.V_d_std),
+        "P_gF": _plain(known.P_gF),
+        "P_gF_std": _plain(known.P_gF_std),
+        "wavelength": _plain(known.wavelengths),
+        "n": _plain(known.n),
+        "n_std": _plain(known.n_std),
+        "singular_values": _plain(known.singular_values),
+        "determined": int(known.determined),
+        "summary": known.summary,
         "free": [
             {"name": name, "value": _plain(value), "std": _plain(std)}
-            for name, value, std in result.free
+            for name, value, std in known.free
         ],
     }
 
@@ -101,7 +110,11 @@ def _nearest_entries(result: FitResult) -> Iterator[dict[str, Any]]:
 
 def write_fit_json(path: str | os.PathLike[str], result: FitResult) -> None:
     """Write `fit_json(result)`: beside, then renamed, so that an older file stays whole."""
-    text = json.dumps(fit_json(result), indent=2, ensure_ascii=False, allow_nan=False)
+    _write_json(path, fit_json(result))
+
+
+def _write_json(path: str | os.PathLike[str], content: dict[str, Any]) -> None:
+    text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
     with replacing(path) as beside:
         beside.write_text(text + "\n", encoding="utf-8")
 
@@ -132,28 +145,38 @@ def result_table(result: FitResult) -> str:
         ("converged", f"{'yes' if result.converged else 'NO'}, {_count(result.steps, 'step')}"),
         *([] if result.converged else [("message", result.message)]),
         ("prior", result.prior),
-        ("n_d", _with_error(result.n_d, result.n_d_std)),
-        ("V_d", _with_error(result.V_d, result.V_d_std)),
-        ("P_gF", _with_error(result.P_gF, result.P_gF_std)),
-        *_coefficient_rows(result),
-        *_free_rows(result),
-        ("determined", f"{result.determined} of {len(result.singular_values)} directions"),
+        *_known_rows(result),
         ("nearest", _nearest(result)),
         *([("glass", _probable(result))] if result.probabilities else []),
         ("residual", f"{result.rms_residual:.3g} rms"),
         *([("check", _checked(result.check))] if result.check else []),
         *([("left out", f"{_count(result.masked, 'pixel')} by the mask")] if result.masked else []),
     ]
-    width = max([11, *(len(value.name) + 2 for value in result.free)])
+    return _table(rows, result)
+
+
+def _table(rows: list[tuple[str, str]], known: FitResult | Uncertainty) -> str:
+    """Rows of two columns, and the summary."""
+    width = max([11, *(len(value.name) + 2 for value in known.free)])
     table = "\n".join(f"{name:<{width}}{text}" for name, text in rows)
-    return f"{table}\n\n{textwrap.fill(result.summary, 79)}"
+    return f"{table}\n\n{textwrap.fill(known.summary, 79)}"
+
+
+def _known_rows(known: FitResult | Uncertainty) -> Iterator[tuple[str, str]]:
+    """What is known of the glass, or will be."""
+    yield "n_d", _with_error(known.n_d, known.n_d_std)
+    yield "V_d", _with_error(known.V_d, known.V_d_std)
+    yield "P_gF", _with_error(known.P_gF, known.P_gF_std)
+    yield from _coefficient_rows(known)
+    yield from _free_rows(known)
+    yield "determined", f"{known.determined} of {len(known.singular_values)} directions"
 
 
 def _count(number: int, thing: str) -> str:
     return f"{number} {thing}{'' if number == 1 else 's'}"
 
 
-def _coefficient_rows(result: FitResult) -> Iterator[tuple[str, str]]:
+def _coefficient_rows(result: FitResult | Uncertainty) -> Iterator[tuple[str, str]]:
     """A line for each of B and C."""
     for name, unit, values, errors in (
         ("B", "", result.B, result.B_std),
@@ -163,7 +186,7 @@ def _coefficient_rows(result: FitResult) -> Iterator[tuple[str, str]]:
             yield f"{name}{i}{unit}", _coefficient(float(value), float(error))
 
 
-def _free_rows(result: FitResult) -> Iterator[tuple[str, str]]:
+def _free_rows(result: FitResult | Uncertainty) -> Iterator[tuple[str, str]]:
     """A line for each number that was free beside B and C; one for all gains."""
     gains = [value for value in result.free if value.name.startswith("gain[")]
     for value in result.free:
@@ -269,7 +292,10 @@ def _draw_pictures(axes: list[Axes], result: FitResult, target: Picture) -> None
 def _channels(target: Picture) -> str:
     if target.wavelengths is None:
         return "red, green, blue"
-    count = len(target.wavelengths)
+    return _bands(len(target.wavelengths))
+
+
+def _bands(count: int) -> str:
     return "1 band" if count == 1 else f"{count} bands"
 
 
@@ -400,6 +426,140 @@ _HANGING: dict[str, Any] = {
     "replace_whitespace": False,
 }
 """How a line of the table is broken: what follows stands under the second column."""
+
+
+# What to expect of a bench.
+
+
+def bench_table(bench: Bench) -> str:
+    """What to expect as a short table, the summary, and the best of what was varied.
+
+    Args:
+        bench: of `vary_bench`.
+
+    Returns:
+        Lines without a newline after the last one; errors are 1 sigma.
+    """
+    expected, film = bench.expected, bench.film
+    channels = "colour" if film.wavelengths is None else _bands(film.channels)
+    rows = [
+        ("object", expected.object_name or "(unnamed)"),
+        ("picture", f"{film.width} x {film.height} pixels, {channels}"),
+        ("noise", f"{expected.noise:g} in each value"),
+        ("prior", expected.prior),
+        *_known_rows(expected),
+    ]
+    return "\n".join([_table(rows, expected), *_variation_lines(bench)])
+
+
+def _variation_lines(bench: Bench) -> Iterator[str]:
+    """The best value of each thing that was varied, and what was left out, a line each."""
+    if bench.variations:
+        yield "\nBest of the values tried, one thing changed at a time:"
+    for some in bench.variations:
+        value, error = some.values[some.best], some.n_d_std[some.best]
+        said = f"  {some.quantity}: {value:.4g}{f' {some.unit}' if some.unit else ''}"
+        if value == some.own:
+            yield f"{said}, as it is"
+        else:
+            change = f"{error:.2g} instead of {bench.expected.n_d_std:.2g}"
+            yield f"{said} instead of {some.own:.4g}; σ of n_d {change}"
+    for text in bench.left_out:
+        yield f"Left out: {text}."
+
+
+def bench_json(bench: Bench) -> dict[str, Any]:
+    """What to expect as the content of `plan.json`.
+
+    Args:
+        bench: of `vary_bench`.
+
+    Returns:
+        As of `fit_json`.
+    """
+    return {
+        "object": bench.expected.object_name,
+        "prior": bench.expected.prior,
+        "noise": _plain(bench.expected.noise),
+        "size": [bench.film.width, bench.film.height],
+        **_known_json(bench.expected),
+        "variations": [
+            {
+                "quantity": some.quantity,
+                "unit": some.unit,
+                "own": _plain(some.own),
+                "values": _plain(some.values),
+                "n_d_std": _plain(some.n_d_std),
+                "V_d_std": _plain(some.V_d_std),
+                "best": _plain(some.values[some.best]),
+            }
+            for some in bench.variations
+        ],
+        "left_out": list(bench.left_out),
+    }
+
+
+def write_bench_json(path: str | os.PathLike[str], bench: Bench) -> None:
+    """Write `bench_json(bench)`: beside, then renamed, so that an older file stays whole."""
+    _write_json(path, bench_json(bench))
+
+
+def write_bench_plot(path: str | os.PathLike[str], bench: Bench) -> None:
+    """Draw how the errors of n_d and V_d change with each thing that was varied.
+
+    The file is written beside and renamed.
+
+    Args:
+        path: where to; the suffix says the format: .png, .pdf or .svg.
+        bench: of `vary_bench`.
+
+    Raises:
+        ValueError: a suffix that cannot be drawn, or a folder that does not exist.
+    """
+    check_plot_output(path)
+    rows = -(-len(bench.variations) // 2)
+    figure = Figure(figsize=(10.5, 3.9 * rows), layout="constrained")
+    known = bench.expected
+    title = (
+        f"What a picture would tell of {known.object_name or 'the ball'} at a noise of"
+        f" {known.noise:g}; as it is, n_d to {known.n_d_std:.2g} and V_d to {known.V_d_std:.2g}"
+    )
+    figure.suptitle(title.replace("$", r"\$"))
+    axes = figure.subplots(rows, 2, sharey=True, squeeze=False).ravel()
+    for axis, some in zip(axes, bench.variations, strict=False):
+        _draw_variation(axis, some, known)
+    for axis in axes[len(bench.variations) :]:
+        axis.remove()
+    _save(figure, path)
+
+
+def _draw_variation(axis: Axes, some: Variation, known: Uncertainty) -> None:
+    """One thing varied. On the right the scale of V_d, so that both meet at the bench as it is."""
+    ratio = known.V_d_std / known.n_d_std
+    axis.set_xscale("log")
+    axis.set_yscale("log")
+    axis.axvline(some.own, color="0.6", linewidth=1, linestyle=":", zorder=1)
+    if some.counted:
+        more = known.n_d_std * (some.own / some.values) ** (some.counted / 2)
+        axis.plot(some.values, more, color="0.6", linewidth=1, label="1/√(number of values)")
+    axis.plot(some.values, some.n_d_std, "o-", color="C0", markersize=5, label="n_d")
+    axis.plot(some.values, some.V_d_std / ratio, "s--", color="C1", markersize=4, label="V_d")
+    axis.plot(some.own, known.n_d_std, "o", color="k", markersize=9, mfc="none", label="as it is")
+    axis.set_xlabel(f"{some.quantity}{f' ({some.unit})' if some.unit else ''}")
+    axis.xaxis.set_major_locator(FixedLocator(list(some.values)))
+    axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
+    axis.xaxis.set_minor_locator(NullLocator())
+    to_V_d: tuple[Any, Any] = (lambda y: y * ratio, lambda y: y / ratio)
+    right = axis.secondary_yaxis("right", functions=to_V_d)
+    scales = ((axis.yaxis, "σ of n_d", "C0"), (right.yaxis, "σ of V_d", "C1"))
+    for scale, text, color in scales:
+        scale.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        scale.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
+        scale.set_minor_locator(NullLocator())
+        scale.set_label_text(text, color=color)
+    axis.tick_params(labelleft=True)
+    axis.grid(alpha=0.3)
+    axis.legend(fontsize="small")
 
 
 # One glass.

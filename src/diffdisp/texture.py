@@ -106,18 +106,27 @@ def _both_beyond(first: tuple[Real, Real, Real], second: tuple[Real, Real, Real]
         first: one coordinate in its middle, and what both edges add to it.
         second: the same of the other.
     """
-    lines, parts, sign = [], [], jnp.ones_like(first[0])
-    for x, across, down in (first, second):
+    widest = [jnp.maximum(jnp.abs(across), jnp.abs(down)) for _, across, down in (first, second)]
+    sizes = [jnp.where(wide > 0, wide, 1.0) for wide in widest]
+    # Both have to change across the footprint; what changes only down it goes the other way round.
+    by_across, by_down = (
+        jnp.minimum(
+            *(jnp.abs(axis[k]) / size for axis, size in zip((first, second), sizes, strict=True))
+        )
+        for k in (1, 2)
+    )
+    swaps, lines, parts, sign = by_down > by_across, [], [], jnp.ones_like(first[0])
+    for (x, across, down), size in zip((first, second), sizes, strict=True):
+        part = covered(x, across, down)
+        across, down = choose(swaps, (down, across), (across, down))
         mirror = jnp.where(across < 0, -1.0, 1.0)
+        parts.append(jnp.where(mirror < 0, 1.0 - part, part))
         sign = sign * mirror
-        x, across, down = x * mirror, across * mirror, down * mirror
-        wide = jnp.maximum(across, jnp.abs(down))
-        least = jnp.where(wide > 0, 1e-3 * wide, 1.0)
-        across = jnp.maximum(across, least)
-        down = jnp.where(down < 0, -1.0, 1.0) * jnp.maximum(jnp.abs(down), least)
-        parts.append(covered(x, across, down))
+        across = jnp.maximum(jnp.abs(across), SLIVER * size)
         # The part of a line across at t, from -1/2 to 1/2 down, is this straight line cut off.
-        lines.append((x / across + 0.5, down / across))
+        lines.append((mirror * x / across + 0.5, mirror * down / across))
+    # Of a footprint along the tiles the one tells nothing of the other.
+    sign = sign * jnp.minimum(jnp.maximum(by_across, by_down) * (1.0 / SLIVER), 1.0)
     (level, slope), (other_level, other_slope) = lines
     # Both are positive in the smaller part: before the lines cross it is that of the steeper.
     turn = slope - other_slope
@@ -162,6 +171,11 @@ def filtered_square_wave(x: Real, across: Real, down: Real) -> Real:
     )
 
 
+SLIVER = 1e-3
+"""A box narrower than this part of the other counts as so wide: it smooths nothing, but dividing by
+less would cancel digits."""
+
+
 def covered(distance: Real, across: Real, down: Real) -> Real:
     """Part of a footprint that lies on the positive side of a straight edge.
 
@@ -179,8 +193,7 @@ def covered(distance: Real, across: Real, down: Real) -> Real:
 def _widths(across: Real, down: Real) -> tuple[Real, Real]:
     """Widths of the wider and of the narrower of two boxes."""
     wide = jnp.maximum(jnp.abs(across), jnp.abs(down))
-    # A box far narrower than the other smooths nothing, but dividing by it would cancel digits.
-    return wide, jnp.maximum(jnp.minimum(jnp.abs(across), jnp.abs(down)), 1e-3 * wide)
+    return wide, jnp.maximum(jnp.minimum(jnp.abs(across), jnp.abs(down)), SLIVER * wide)
 
 
 def _near_edge(x: Real, wide: Real, narrow: Real) -> Real:
