@@ -863,13 +863,15 @@ def _descend(
     unknowns = problem.unknowns
     least = LEAST_CHANGE[0] if problem.film.wavelengths is not None else LEAST_CHANGE[1]
     lin, damping, converged = look(at), 0.0, False
-    steps, anchor = 1, at.z
+    steps, anchor, before = 1, at.z, 0.0
     while steps < most and not converged:
         problem.progress(steps, lin.rms, _n_d(unknowns, at.z))
         # Whether a minimum is near, a step tells that nothing holds back.
         new, change = _next_point(unknowns, at, anchor, lin, 0.0)
         largest, visible = _largest(unknowns, at, new), np.linalg.norm(lin.r @ change)
-        if largest < least or visible < small * lin.noise:
+        # Near a minimum each step shrinks at least as much as the one before it did.
+        following = largest * min(largest / before, 1.0) if before else largest
+        if following < least or visible < small * lin.noise:
             # So near the picture is linear: it need not be traced again.
             at, lin, converged = new, lin.moved(change), True
             break
@@ -888,6 +890,7 @@ def _descend(
         if has > had and largest < 100 * least:
             converged = True  # what is left of the residual is rounding
         elif has <= had or rough:
+            before = 0.0 if damping else largest
             at, lin, damping = new, tried, damping / 10 if damping > 1e-2 else 0.0
         else:
             damping = max(10 * damping, 1.0)
@@ -984,8 +987,10 @@ def _starts(problem: Problem, level: Level, most: int) -> list[Point]:
     waves, weights, columns = _few_wavelengths(film)
     target = level.target[:, columns]
     found: list[tuple[float, float, Point]] = []
-    for z in _variants(unknowns, waves):
-        index = np.asarray(unknowns.coefficients.index(z, waves))
+    variants = np.stack(_variants(unknowns, waves))
+    for z, index in zip(
+        variants, np.asarray(_indices(unknowns.coefficients, variants, waves)), strict=True
+    ):
         if index.min() < INDEX_GRID[0] or index.max() >= INDEX_GRID[-1]:
             continue
         place = np.interp(index, INDEX_GRID, np.arange(len(INDEX_GRID)))
@@ -1006,6 +1011,12 @@ def _starts(problem: Problem, level: Level, most: int) -> list[Point]:
     return [at for _, _, at in chosen] or [
         Point(unknowns.coefficients.start(), np.zeros(problem.free.total))
     ]
+
+
+@jax.jit
+def _indices(coefficients: Coefficients, zs: Array, waves: Array) -> jax.Array:
+    """Index (n, k) at many coordinates (n, free) and k wavelengths."""
+    return jax.vmap(lambda z: coefficients.index(z, waves))(zs)
 
 
 def _exposed(
