@@ -71,6 +71,9 @@ is 16 and 64 samples a pixel, by one program."""
 REFINED = 0.5
 """Part of the pixels that show the ball that get the more samples."""
 
+HELD = 1e3
+"""Weight against which directions that are held move, where the residual's norm is 1."""
+
 DETERMINED = 0.1
 """A direction of log B, log C counts as determined when its standard deviation is below this."""
 
@@ -260,6 +263,16 @@ class Coefficients(eqx.Module):
         n_squared = 1 + jnp.sum(terms, axis=-1)
         low = 0.25 / (1 - jnp.minimum(n_squared / 0.25 - 1, 0.0))
         return jnp.sqrt(jnp.where(n_squared > 0.25, n_squared, low))
+
+    def smooth(self) -> np.ndarray:
+        """Directions (free, 3) that keep n(λ) smooth.
+
+        Strength of the terms below the band, of those above it, and where those below it are.
+        """
+        below = np.tile(self.C < self.low**2, 2)
+        strength = np.arange(6) < 3
+        columns = (strength & below, strength & ~below, ~strength & below)
+        return np.stack(columns, axis=1)[list(self.free)].astype(float)
 
     def logarithms(self, z: Array) -> jax.Array:
         """Log |B| and log C (free,) at `z`, in which results are reported."""
@@ -739,6 +752,7 @@ class Step(NamedTuple):
         damping: (m,) weights that keep the change of n within what a linear picture can tell.
         anchor: (free,) where z stays if the picture says nothing.
         near: weight of that.
+        hold: (free, free) rows that keep z - anchor to some directions.
         prior: weight of the prior's rows.
     """
 
@@ -750,6 +764,7 @@ class Step(NamedTuple):
     damping: Array
     anchor: Array
     near: Array
+    hold: Array
     prior: Array
 
 
@@ -763,6 +778,7 @@ def _step_rows(dz: Array, step: Step) -> jax.Array:
             step.r @ change + step.q,
             step.damping * change,
             step.near * (z - step.anchor),
+            step.hold @ (z - step.anchor),
             step.prior * logs,
         ]
     )
@@ -785,9 +801,18 @@ def _solve_step(step: Step) -> Array:
 
 
 def _next_point(
-    unknowns: Unknowns, at: Point, anchor: np.ndarray, lin: Linearised, damping: float
+    unknowns: Unknowns,
+    at: Point,
+    anchor: np.ndarray,
+    lin: Linearised,
+    damping: float,
+    smooth: bool = False,
 ) -> tuple[Point, np.ndarray]:
     """The point that the picture linearised at `at` asks for, and the change (total,) to it."""
+    hold = np.zeros((len(at.z), len(at.z)))
+    if smooth:
+        directions = unknowns.coefficients.smooth()
+        hold = HELD * (np.eye(len(hold)) - directions @ np.linalg.pinv(directions))
     left = lin.eliminated(damping)
     index = unknowns.coefficients.index(at.z, unknowns.reference)
     near = lin.noise / WIDEST
@@ -801,6 +826,7 @@ def _next_point(
         np.sqrt(damping) * np.sqrt(np.sum(left.r**2, axis=0)) / size,
         anchor,
         np.asarray(near / size),
+        hold,
         np.asarray(lin.noise / size),
     )
     z = np.asarray(_solve_step(step))
@@ -842,6 +868,7 @@ def _descend(
     most: int,
     small: float,
     along: Level | None = None,
+    smooth: bool = False,
 ) -> Descent:
     """Gauss-Newton steps from a point, `most` at most, until one is small.
 
@@ -853,6 +880,7 @@ def _descend(
         most: pictures to trace at most.
         small: a step that changes the picture by less than this part of its noise is the last.
         along: where slopes along the scene's numbers are taken; by default on the level itself.
+        smooth: whether B and C move along the `Coefficients.smooth` directions alone.
     """
 
     def look(at: Point, known: Columns | None = None) -> Linearised:
@@ -867,7 +895,7 @@ def _descend(
     while steps < most and not converged:
         problem.progress(steps, lin.rms, _n_d(unknowns, at.z))
         # Whether a minimum is near, a step tells that nothing holds back.
-        new, change = _next_point(unknowns, at, anchor, lin, 0.0)
+        new, change = _next_point(unknowns, at, anchor, lin, 0.0, smooth)
         largest, visible = _largest(unknowns, at, new), np.linalg.norm(lin.r @ change)
         # Near a minimum each step shrinks at least as much as the one before it did.
         following = largest * min(largest / before, 1.0) if before else largest
@@ -876,7 +904,7 @@ def _descend(
             at, lin, converged = new, lin.moved(change), True
             break
         if damping:
-            new, change = _next_point(unknowns, at, anchor, lin, damping)
+            new, change = _next_point(unknowns, at, anchor, lin, damping, smooth)
             largest, visible = _largest(unknowns, at, new), np.linalg.norm(lin.r @ change)
         near = visible < NEAR_STEP * lin.noise
         # After so small a step the scene's slopes, which cost most, are still the same.
@@ -1129,8 +1157,14 @@ def _fit(problem: Problem, target: Picture, prior: str, noise: float | None) -> 
     film, depth, seed = problem.film, target.depth or 50, target.seed or 0
     coarse = max(1, -(-max(film.width, film.height) // COARSE_PIXELS))
     level = _level(problem, coarse, FEW_SAMPLES, depth, seed)
-    ends = [_descend(problem, level, at, CUTOFF, 8, 1.0) for at in _starts(problem, level, 3)]
+    # With all six coordinates a band can stay in a minimum of its own, where n is wrong in that
+    # band alone, from a resonance that moves next to it.
+    ends = [
+        _descend(problem, level, at, CUTOFF, 8, 1.0, smooth=True)
+        for at in _starts(problem, level, 3)
+    ]
     best = min(ends, key=lambda end: end.lin.cost)
+    best = _descend(problem, level, best.at, CUTOFF, 8, 1.0)
     along = None
     if target.samples is None:
         level = _level(problem, 1, FEW_SAMPLES, depth, seed)
