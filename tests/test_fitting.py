@@ -102,6 +102,22 @@ def test_a_visible_clean_picture_gives_the_index_and_says_what_it_does_not_give(
     assert f"{result.determined} of the 6" in result.summary
 
 
+def test_a_clean_fit_ends_where_its_steps_say_that_the_next_would_be_nothing(visible_fit):
+    # One picture whose paths end early and two with all their light, which costs three times as
+    # much: the second step from there changes n by 1e-11, after one of 1e-7.
+    assert visible_fit.steps == 3
+    assert index_error(visible_fit, BK7) < 1e-14
+
+
+def test_no_band_of_a_low_index_stays_in_a_minimum_of_its_own():
+    # So few samples draw a ball of low index roughly: single bands have minima up to 1e-2 from
+    # the right index, and a resonance next to the band reaches them without moving the others.
+    answer = named_glass("MgF2")
+    result = fit(bench(named_glass("N-SF66")), own_target(bench(answer), VISIBLE))
+    assert result.converged, result.message
+    assert index_error(result, answer) < 1e-9
+
+
 def test_a_result_agrees_with_itself(visible, visible_fit):
     result = visible_fit
     assert result.object_name == "ball"

@@ -7,6 +7,7 @@ squares, has a handful of rows and needs no picture: optimistix solves it, non-l
 ill-conditioned as it is, in milliseconds.
 """
 
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -69,12 +70,15 @@ SPLITS = (2, 4, 10)
 samples: most pixels, those that more samples change most, and those of them that need still more.
 With `FEW_SAMPLES` in each part that is 16, 64 and 400 samples a pixel, by one program."""
 
-REFINED = (0.5, 0.15)
+REFINED = (0.5, 0.35)
 """Parts of the pixels that show the ball that get the more samples, and the most of them."""
 
 TOLERATED = 0.1
 """Part of the noise that an error of a pixel may be without the most samples: next to its rim the
 bench's ball is at 64 samples a pixel as far off as a noise of 1 %."""
+
+HELD = 1e3
+"""Weight against which directions that are held move, where the residual's norm is 1."""
 
 DETERMINED = 0.1
 """A direction of log B, log C counts as determined when its standard deviation is below this."""
@@ -375,6 +379,16 @@ class Coefficients(eqx.Module):
         n_squared = 1 + jnp.sum(terms, axis=-1)
         low = 0.25 / (1 - jnp.minimum(n_squared / 0.25 - 1, 0.0))
         return jnp.sqrt(jnp.where(n_squared > 0.25, n_squared, low))
+
+    def smooth(self) -> np.ndarray:
+        """Directions (free, 3) that keep n(λ) smooth.
+
+        Strength of the terms below the band, of those above it, and where those below it are.
+        """
+        below = np.tile(self.C < self.low**2, 2)
+        strength = np.arange(6) < 3
+        columns = (strength & below, strength & ~below, ~strength & below)
+        return np.stack(columns, axis=1)[list(self.free)].astype(float)
 
     def logarithms(self, z: Array) -> jax.Array:
         """Log |B| and log C (free,) at `z`, in which results are reported."""
@@ -1086,14 +1100,19 @@ def _deviation(sizes: np.ndarray, counts: np.ndarray) -> float:
 
 
 def _settled(
-    problem: Problem, level: Level, at: Point, anchor: np.ndarray, lin: Linearised
+    problem: Problem,
+    level: Level,
+    at: Point,
+    anchor: np.ndarray,
+    lin: Linearised,
+    smooth: bool = False,
 ) -> tuple[Level, Point, Linearised]:
     """Where the least misfit lies if the picture is linear: steps without tracing.
 
     Squares need one step. What clipped values and outliers pull changes on the way.
     """
     for _ in range(SETTLE):
-        new, change = _next_point(problem.unknowns, at, anchor, lin, 0.0)
+        new, change = _next_point(problem.unknowns, at, anchor, lin, 0.0, smooth)
         if level.clipped is None and level.robust is None:
             return level, new, lin.moved(change)
         visible = np.linalg.norm(lin.r @ change)
@@ -1119,6 +1138,7 @@ class Step(NamedTuple):
         damping: (m,) weights that keep the change of n within what a linear picture can tell.
         anchor: (free,) where z stays if the picture says nothing.
         near: weight of that.
+        hold: (free, free) rows that keep z - anchor to some directions.
         prior: weight of the prior's rows.
     """
 
@@ -1130,6 +1150,7 @@ class Step(NamedTuple):
     damping: Array
     anchor: Array
     near: Array
+    hold: Array
     prior: Array
 
 
@@ -1143,6 +1164,7 @@ def _step_rows(dz: Array, step: Step) -> jax.Array:
             step.r @ change + step.q,
             step.damping * change,
             step.near * (z - step.anchor),
+            step.hold @ (z - step.anchor),
             step.prior * logs,
         ]
     )
@@ -1165,9 +1187,18 @@ def _solve_step(step: Step) -> Array:
 
 
 def _next_point(
-    unknowns: Unknowns, at: Point, anchor: np.ndarray, lin: Linearised, damping: float
+    unknowns: Unknowns,
+    at: Point,
+    anchor: np.ndarray,
+    lin: Linearised,
+    damping: float,
+    smooth: bool = False,
 ) -> tuple[Point, np.ndarray]:
     """The point that the picture linearised at `at` asks for, and the change (total,) to it."""
+    hold = np.zeros((len(at.z), len(at.z)))
+    if smooth:
+        directions = unknowns.coefficients.smooth()
+        hold = HELD * (np.eye(len(hold)) - directions @ np.linalg.pinv(directions))
     left = lin.eliminated(damping)
     index = unknowns.coefficients.index(at.z, unknowns.reference)
     near = lin.noise / WIDEST
@@ -1181,6 +1212,7 @@ def _next_point(
         np.sqrt(damping) * np.sqrt(np.sum(left.r**2, axis=0)) / size,
         anchor,
         np.asarray(near / size),
+        hold,
         np.asarray(lin.noise / size),
     )
     z = np.asarray(_solve_step(step))
@@ -1226,6 +1258,7 @@ def _descend(
     most: int,
     small: float,
     along: Level | None = None,
+    smooth: bool = False,
 ) -> Descent:
     """Gauss-Newton steps from a point, `most` at most, until one is small.
 
@@ -1237,6 +1270,7 @@ def _descend(
         most: pictures to trace at most.
         small: a step that changes the picture by less than this part of its noise is the last.
         along: where slopes along the scene's numbers are taken; by default on the level itself.
+        smooth: whether B and C move along the `Coefficients.smooth` directions alone.
     """
 
     def keep() -> None:
@@ -1257,20 +1291,22 @@ def _descend(
     brightest = problem.free.brightest
     level, lin = _rescaled(level, look(at), brightest)
     damping, converged = 0.0, False
-    steps, anchor = 1, at.z
+    steps, anchor, before = 1, at.z, 0.0
     keep()
     while steps < most and not converged:
         problem.progress(steps, lin.rms, _n_d(unknowns, at.z))
         # Whether a minimum is near, a step tells that nothing holds back.
-        new, change = _next_point(unknowns, at, anchor, lin, 0.0)
+        new, change = _next_point(unknowns, at, anchor, lin, 0.0, smooth)
         largest, visible = _largest(unknowns, at, new), np.linalg.norm(lin.r @ change)
-        if largest < least or visible < small * lin.noise:
+        # Near a minimum each step shrinks at least as much as the one before it did.
+        following = largest * min(largest / before, 1.0) if before else largest
+        if following < least or visible < small * lin.noise:
             # So near the picture is linear: it need not be traced again.
-            level, at, lin = _settled(problem, level, at, anchor, lin)
+            level, at, lin = _settled(problem, level, at, anchor, lin, smooth)
             converged = True
             break
         if damping:
-            new, change = _next_point(unknowns, at, anchor, lin, damping)
+            new, change = _next_point(unknowns, at, anchor, lin, damping, smooth)
             largest, visible = _largest(unknowns, at, new), np.linalg.norm(lin.r @ change)
         near = visible < NEAR_STEP * lin.noise
         # After so small a step the scene's slopes, which cost most, are still the same.
@@ -1284,6 +1320,7 @@ def _descend(
         if has > had and largest < 100 * least:
             converged = True  # what is left of the residual is rounding
         elif has <= had or rough:
+            before = 0.0 if damping else largest
             at, damping = new, damping / 10 if damping > 1e-2 else 0.0
             level, lin = _rescaled(level, tried, brightest)
             keep()
@@ -1331,9 +1368,10 @@ def _more_samples(
     """A whole picture with samples as `SPLITS` says, weighed by how well they draw each pixel.
 
     Near the rim a ball shows the whole scene within a few pixels, where footprints are neither
-    small nor straight. The pixels that weigh most in the index and change most with the samples
-    get more of them; and since what error is left falls about as the area of a footprint, a
-    quarter of the samples, weighed against all, cancels most of it.
+    small nor straight. The pixels that tell most and change most with the samples get more of
+    them, and most of them where what is left is no small part of the noise. Since that falls about
+    as the area of a footprint, the render of fewer samples, weighed against that of more, cancels
+    most of it.
 
     Args:
         problem: what stays the same.
@@ -1348,9 +1386,14 @@ def _more_samples(
     """
     sigma = max(noise, CLEAN * problem.free.brightest)
     change, seen = np.abs(some.picture - few.picture), int(np.sum(some.weight.any(axis=1)))
-    order = np.argsort(-np.max(change * some.weight, axis=1))
+    told = np.max(change * some.weight, axis=1)
+    changed = np.max(change, axis=1)
+    if problem.free.parameters:
+        # Of these an outline tells most, where the index may show hardly at all.
+        told = changed = _around(problem, level.blocks, changed)
+    order = np.argsort(-told)
     # What a quarter of the samples changes tells the error of these, and that of more.
-    error, hard = np.max(change, axis=1) / 3, np.zeros(len(change), bool)
+    error, hard = changed / 3, np.zeros(len(change), bool)
     hard[order[: int(seen * REFINED[0])]] = True
     error[hard] *= (SPLITS[0] / SPLITS[1]) ** 2
     hardest = hard & (error > TOLERATED * sigma)
@@ -1371,6 +1414,21 @@ def _more_samples(
     )
 
 
+def _around(problem: Problem, blocks: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """The largest value of each pixel (blocks,) and its neighbours.
+
+    An outline may pass between the few samples of one pixel and meet those of the next.
+    """
+    width, height = problem.film.width, problem.film.height
+    whole = np.zeros(width * height)
+    whole[blocks] = values
+    wide = np.pad(whole.reshape(height, width), 1)
+    moves = itertools.product(range(3), repeat=2)
+    near = [wide[down : down + height, right : right + width] for down, right in moves]
+    largest: np.ndarray = np.max(near, axis=0).ravel()[blocks]
+    return largest
+
+
 def _starts(problem: Problem, level: Level, most: int) -> list[Point]:
     """Points to start from: those that explain a coarse picture best, at the best exposure.
 
@@ -1386,8 +1444,10 @@ def _starts(problem: Problem, level: Level, most: int) -> list[Point]:
     if level.clipped is not None:
         over = level.clipped.where[:, columns]
     found: list[tuple[float, float, Point]] = []
-    for z in _variants(unknowns, waves):
-        index = np.asarray(unknowns.coefficients.index(z, waves))
+    variants = np.stack(_variants(unknowns, waves))
+    for z, index in zip(
+        variants, np.asarray(_indices(unknowns.coefficients, variants, waves)), strict=True
+    ):
         if index.min() < INDEX_GRID[0] or index.max() >= INDEX_GRID[-1]:
             continue
         place = np.interp(index, INDEX_GRID, np.arange(len(INDEX_GRID)))
@@ -1410,6 +1470,12 @@ def _starts(problem: Problem, level: Level, most: int) -> list[Point]:
     return [at for _, _, at in chosen] or [
         Point(unknowns.coefficients.start(), np.zeros(problem.free.total))
     ]
+
+
+@jax.jit
+def _indices(coefficients: Coefficients, zs: Array, waves: Array) -> jax.Array:
+    """Index (n, k) at many coordinates (n, free) and k wavelengths."""
+    return jax.vmap(lambda z: coefficients.index(z, waves))(zs)
 
 
 def _exposed(
@@ -1593,15 +1659,23 @@ def _search(problem: Problem, target: Picture) -> "tuple[Level, Descent]":
     film, depth, seed = problem.film, target.depth or 50, target.seed or 0
     coarse = max(1, -(-max(film.width, film.height) // COARSE_PIXELS))
     level = _level(problem, COARSE, coarse, FEW_SAMPLES, depth, seed)
-    ends = [_descend(problem, level, at, CUTOFF, 8, 1.0) for at in _starts(problem, level, 3)]
+    # With all six coordinates a band can stay in a minimum of its own, where n is wrong in that
+    # band alone, from a resonance that moves next to it.
+    ends = [
+        _descend(problem, level, at, CUTOFF, 8, 1.0, smooth=True)
+        for at in _starts(problem, level, 3)
+    ]
     best = min(ends, key=lambda end: end.lin.cost)
+    best = _descend(problem, level, best.at, CUTOFF, 8, 1.0)
     along = None
     if target.samples is None:
         level = _level(problem, FEW, 1, FEW_SAMPLES, depth, seed)
         many = _level(problem, LAST, 1, FEW_SAMPLES, depth, seed, SPLITS[0])
         best = _descend(problem, level, best.at, CUTOFF, 20, 1.0)
         level, at = _refined(problem, best, many, depth)
-        along = many if problem.free.parameters else None
+        # Slopes next to an outline are steep too.
+        finer = _level(problem, LAST, 1, FEW_SAMPLES, depth, seed, SPLITS[1])
+        along = finer if problem.free.parameters else None
     else:
         level, at = _level(problem, LAST, 1, target.samples, depth, seed), best.at
     best = _descend(problem, level, at, CUTOFF, 30, LINEAR_STEP, along)

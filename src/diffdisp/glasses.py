@@ -64,6 +64,25 @@ N-SF57   1.87543831   0.37375749   2.30001797   0.0141749518  0.0640509927 177.3
 N-SF66   2.0245976    0.470187196  2.59970433   0.0147053225  0.0692998276 161.817601 0.39  2.5
 """
 
+_SCHOTT_ZEMAX = "Schott Zemax catalogue 2017-01-20b, as the refractiveindex.info database has it"
+
+_SCHOTT_ZEMAX_TABLE = """
+N-BK10   0.888308131 0.328964475  0.984610769 0.00516900822 0.0161190045 99.7575331 0.29  2.5
+N-KF9    1.19286778  0.0893346571 0.920819805 0.00839154696 0.0404010786 112.572446 0.35  2.5
+N-BAK1   1.12365662  0.309276848  0.881511957 0.00644742752 0.0222284402 107.297751 0.3   2.5
+N-BAK2   1.01662154  0.319903051  0.937232995 0.00592383763 0.0203828415 113.118417 0.3   2.5
+N-BAF4   1.42056328  0.102721269  1.14380976  0.00942015382 0.0531087291 110.278856 0.365 2.5
+N-BALF4  1.31004128  0.142038259  0.964929351 0.0079659645  0.0330672072 109.19732  0.35  2.5
+N-BASF64 1.65554268  0.17131977   1.33664448  0.0104485644  0.0499394756 118.961472 0.365 2.5
+N-SK2    1.28189012  0.257738258  0.96818604  0.0072719164  0.0242823527 110.377773 0.31  2.5
+N-SK14   0.936155374 0.594052018  1.04374583  0.00461716525 0.016885927  103.736265 0.31  2.5
+N-SSK8   1.44857867  0.117965926  1.06937528  0.00869310149 0.0421566593 111.300666 0.35  2.5
+N-LAK8   1.33183167  0.546623206  1.19084015  0.00620023871 0.0216465439 82.5827736 0.31  2.5
+N-LAK14  1.50781212  0.318866829  1.14287213  0.00746098727 0.0242024834 80.9565165 0.31  2.5
+N-SF1    1.60865158  0.237725916  1.51530653  0.0119654879  0.0590589722 135.521676 0.37  2.5
+N-SF4    1.67780282  0.282849893  1.63539276  0.012679345   0.0602038419 145.760496 0.365 2.5
+"""
+
 # The papers print the resonance wavelengths; C is their square.
 _PAPERS = {
     "fused silica": _Published(
@@ -113,17 +132,17 @@ _PAPERS = {
 }
 
 
-def _schott_rows() -> dict[str, _Published]:
-    """The rows of the Schott table by catalogue name."""
+def _rows(table: str, source: str) -> dict[str, _Published]:
+    """The rows of a Schott table by catalogue name."""
     published = {}
-    for row in _SCHOTT_TABLE.strip().splitlines():
+    for row in table.strip().splitlines():
         name, *words = row.split()
         B1, B2, B3, C1, C2, C3, low, high = map(float, words)
-        published[name] = _Published((B1, B2, B3), (C1, C2, C3), (low, high), _SCHOTT)
+        published[name] = _Published((B1, B2, B3), (C1, C2, C3), (low, high), source)
     return published
 
 
-_TABLE = _schott_rows() | _PAPERS
+_TABLE = _rows(_SCHOTT_TABLE, _SCHOTT) | _rows(_SCHOTT_ZEMAX_TABLE, _SCHOTT_ZEMAX) | _PAPERS
 
 _CATALOGUE_SUFFIXES = (".agf", ".yml", ".yaml")
 

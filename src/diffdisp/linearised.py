@@ -85,7 +85,8 @@ class Linearised(NamedTuple):
     def moved(self, change: np.ndarray) -> "Linearised":
         """The same after a change (total,) of the unknowns, as far as the picture is linear."""
         q = self.q + self.r @ change
-        cost = self.cost + float(np.sum(q**2) - np.sum(self.q**2))
+        # Where the change explains all there is, rounding may leave less than nothing.
+        cost = max(self.cost + float(np.sum(q**2) - np.sum(self.q**2)), 0.0)
         rms = self.rms * np.sqrt(cost / self.cost) if self.cost > 0 else 0.0
         picture = self.picture + self.columns.along(change)
         return self._replace(q=q, cost=cost, rms=float(rms), picture=picture)
