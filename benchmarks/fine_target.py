@@ -85,6 +85,7 @@ def main() -> None:
     add("--samples", type=int, default=1024, help="per pixel, of the picture before noise")
     add("--repeats", type=int, default=5, help="noise seeds")
     options = parser.parse_args()
+    jax.config.update("jax_compilation_cache_dir", None)  # so that a first fit compiles
     film = Film(options.size, options.size, band_middles(400.0, 700.0, options.bands))
     clean, drawing = clean_picture(film, options.samples)
     print(f"drawn in {drawing:.0f} s", file=sys.stderr, flush=True)
