@@ -79,6 +79,7 @@ def main() -> None:
     add("--noise", type=float, default=0.01, help="standard deviation; the brightest tile has 1")
     add("--samples", type=int, default=256, help="per pixel, of the pictures before noise")
     options = parser.parse_args()
+    jax.config.update("jax_compilation_cache_dir", None)  # so that a first fit compiles
     film = Film(options.size, options.size, band_middles(400.0, 700.0, options.bands))
     chosen = names(options.glasses)
     clean = {}

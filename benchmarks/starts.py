@@ -223,6 +223,7 @@ def main() -> None:
     add("--level-samples", type=int, default=16, help="per pixel, for the ways compared")
     add("--pairs", type=int, default=5, help="answer and start, for the ways compared")
     options = parser.parse_args()
+    jax.config.update("jax_compilation_cache_dir", None)  # so that a first fit compiles
     film = Film(options.size, options.size, band_middles(400.0, 700.0, options.bands))
     fits = every_start(options, film)
     rows = by_answer(fits)
