@@ -300,7 +300,8 @@ def test_what_to_expect_as_a_table():
 def test_what_to_expect_as_json(tmp_path):
     write_bench_json(tmp_path / "plan.json", fake_bench())
     read = json.loads((tmp_path / "plan.json").read_text(encoding="utf-8"))
-    of_fits_alone = {"converged", "message", "steps", "rms_residual", "nearest_glasses"}
+    of_fits_alone = {"converged", "message", "stopped", "steps", "rms_residual", "loss"}
+    of_fits_alone |= {"nearest_glasses", "other_glass_probability", "check"}
     own = {"noise", "size", "variations", "left_out"}
     assert read.keys() == (KEYS - of_fits_alone) | own == bench_json(fake_bench()).keys()
     assert read["variations"][0] == {
