@@ -6,6 +6,9 @@ reflections turned by D_p, as far from the centre as it came, and meets the scre
 that needs no tracing. Its central differences in n are those of hard edges. Points that jump
 over an edge are few, so they are noisy; but two pictures A and B of different points make
 independent errors, and the mean of (S - A)(S - B) has none of either's noise in it.
+
+Of the outline of a lamp that is seen through the ball, the measure is central differences of
+renders of so many samples that a step crosses several of each pixel on the outline.
 """
 
 import argparse
@@ -19,7 +22,22 @@ import jax.numpy as jnp
 import numpy as np
 from record import ROOT, print_table, write_record
 
-from diffdisp import Film, Scene, Sellmeier, band_middles, load_scene, render, with_glass
+from diffdisp import (
+    Background,
+    Camera,
+    Dielectric,
+    Emitter,
+    Film,
+    Object,
+    Scene,
+    Sellmeier,
+    Sphere,
+    band_middles,
+    load_scene,
+    named_glass,
+    render,
+    with_glass,
+)
 
 BENCH = ROOT / "fixtures/scenes/bench_nbk7.toml"
 BALL, SCREEN = 0, 1
@@ -30,6 +48,8 @@ NEGLECTED = 1e-9
 """Part of its light with which a ray of the closed form ends."""
 MOST_ORDERS = 2000
 """For rays so close to grazing that they hardly lose light: fewer than one in a million."""
+OUTLINE_SAMPLES, OUTLINE_STEP = (1600, 2116), 2e-3
+"""Of the pictures whose differences tell how a lamp's outline moves, and the step in n."""
 PLASTIC = 1.32471795724474602596
 """Root of x³ = x + 1, for evenly spread points. Source: Roberts, The unreasonable effectiveness
 of quasirandom sequences (2018)."""
@@ -223,6 +243,31 @@ def _rendered(
     }
 
 
+def outline(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """The derivative where a lamp's outline is seen through the ball, against differences."""
+    lamp = Object(Sphere([0.25, 0.2, -3.0], 0.5), Emitter([1.0, 1, 1]), "lamp")
+    ball = Object(Sphere([0.0, 0, 0], 1.0), Dielectric("N-BK7"), "ball")
+    camera = Camera([0.0, 0, 4], [0.0, 0, 0], vertical_fov=34.0)
+    scene = Scene(camera, [ball, lamp], Background([0.2, 0.2, 0.2]))
+    n = float(named_glass("N-BK7").refractive_index(np.asarray(WAVELENGTH)))
+    pair = []
+    for samples in OUTLINE_SAMPLES:
+        picture = jax.jit(index_picture(scene, options.size // 2, samples))
+        more, less = (
+            np.asarray(picture(jnp.asarray(n + h))) for h in (OUTLINE_STEP, -OUTLINE_STEP)
+        )
+        pair.append((more - less) / (2 * OUTLINE_STEP))
+    truth, rows = np.stack(pair), []
+    for samples in options.samples:
+        picture = index_picture(scene, options.size // 2, samples)
+        both = jax.jit(lambda n, of=picture: jax.jvp(of, (n,), (jnp.ones_like(n),))[1])
+        slope = np.asarray(both(jnp.asarray(n)))
+        rows.append(
+            {"samples": samples, "from_hard_edges": apart(slope, truth), "noise": noise(truth)}
+        )
+    return rows
+
+
 # What it costs.
 
 
@@ -287,6 +332,7 @@ def main() -> None:
             figures[f"cost_{dtype}"] = cost(scene, options.runs)
     with jax.enable_x64(True):
         figures |= accuracy(scene, options)
+        figures["outline"] = outline(options)
     for dtype in ("float32", "float64"):
         head = (dtype, "wall s", "CPU s", "wall ratio", "CPU ratio", "first s")
         print_table(head, [list(row.values()) for row in figures[f"cost_{dtype}"]])
@@ -296,6 +342,9 @@ def main() -> None:
     print()
     head = ("samples", "to hard edges", "to own differences", "largest", "its difference")
     print_table(head, [list(row.values())[: len(head)] for row in figures["render"]])
+    print()
+    head = ("samples", "outline: to hard edges", "noise of those")
+    print_table(head, [list(row.values()) for row in figures["outline"]])
     write_record("derivative", vars(options), figures)
 
 

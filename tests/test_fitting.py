@@ -600,7 +600,7 @@ def test_a_mask_goes_with_a_picture_that_does_not_say_how_it_was_drawn():
     free = ("ball.center", "ball.radius")
     result = fit(bench(SILICA), noisy, free=free, noise=NOISE, mask=mask)
     assert result.converged, result.message
-    assert result.samples == (16, 16, 64)
+    assert result.samples == (16, 16, 64, 64, 1024)
     # As without a mask, in `test_place_and_size_from_a_picture_...`.
     assert abs(result.n_d - float(BK7.n_d)) < 4 * result.n_d_std < 0.025
 
@@ -661,7 +661,7 @@ def test_place_size_and_exposure_are_found_with_the_glass():
     shape = result.scene.objects[0].shape
     assert [*shape.center, shape.radius] == [value.value for value in result.free[:4]]
     assert "and with ball.center and ball.radius and gain and black free" in result.summary
-    assert "these errors are too small" in result.summary
+    assert "too small" not in result.summary
     # What is not known costs: with all the rest known the same noise leaves a tenth of that error.
     known = fit(displaced(SILICA), with_noise(clean, 6, 1e-3), noise=1e-3)
     assert known.free == ()
@@ -674,7 +674,7 @@ def test_place_and_size_from_a_picture_that_does_not_say_how_it_was_drawn():
     noisy = with_noise(Picture(np.asarray(clean), film.wavelengths), 11)
     result = fit(bench(SILICA), noisy, free=("ball.center", "ball.radius"), noise=NOISE)
     assert result.converged, result.message
-    assert result.samples == (16, 16, 64)
+    assert result.samples == (16, 16, 64, 64, 1024)
     # As above.
     for name, value, std in result.free:
         assert abs(value - FREE_TRUTH[name]) < 4 * std, (name, value, std)
@@ -688,7 +688,7 @@ def test_place_and_size_from_a_picture_that_does_not_say_how_it_was_drawn():
     ]
     # Of z and the radius too. The fit's errors are from one residual: 9 % measured, 2 % elsewhere.
     np.testing.assert_allclose(*zip(*both, strict=True), rtol=0.15)
-    assert "these errors are too small" in expected.summary
+    assert "too small" not in expected.summary
 
 
 def test_a_colour_picture_of_another_exposure(color):

@@ -65,17 +65,19 @@ COARSE_PIXELS = 32
 FEW_SAMPLES = 4
 """Film samples per pixel on the way to the last level."""
 
-SPLITS = (2, 4, 10)
+SPLITS = (2, 4, 16)
 """Into how many parts each way the last level splits a pixel, where the target does not say its own
-samples: most pixels, those that more samples change most, and those of them that need still more.
-With `FEW_SAMPLES` in each part that is 16, 64 and 400 samples a pixel, by one program."""
+samples: most pixels, those that more samples change most, and where numbers of the scene are free,
+those around an outline. With `FEW_SAMPLES` in each part that is 16, 64 and 1024 samples a pixel, by
+one program."""
 
 REFINED = (0.5, 0.35)
 """Parts of the pixels that show the ball that get the more samples, and the most of them."""
 
 TOLERATED = 0.1
-"""Part of the noise that an error of a pixel may be without the most samples: next to its rim the
-bench's ball is at 64 samples a pixel as far off as a noise of 1 %."""
+"""Part of the noise that an error of a pixel may be without the most samples. At 64 samples those
+next to the rim of the bench's ball are as far off as a noise of 1 %, alike in all bands; at 1024 a
+tenth of that."""
 
 HELD = 1e3
 """Weight against which directions that are held move, where the residual's norm is 1."""
@@ -105,12 +107,8 @@ the next one is far below a tenth of the noise: 2.5 times, then 0.06 measured on
 SMALL_STEP = 0.1
 """A step that changes the picture by less than this part of its noise ends the fit."""
 
-UNDERSTATED = (
-    " With numbers of the scene free these errors are too small, by a factor of two or more: the"
-    " derivatives do not know edges that move with them."
-)
-"""What has to be said of errors beside free numbers of the scene: on the bench at a noise of 1 %,
-with place and radius of the ball free, n_d was up to 5.4 reported standard deviations off."""
+UNDERSTATED = " In this scene derivatives do not know how {} move: these errors may be too small."
+"""What has to be said where derivatives are not those of the picture: see `_edges_without`."""
 
 UNFINISHED = " The fit was stopped: its answer may lie many of these errors away."
 """What has to be said of errors that are those about a point, which is no minimum yet."""
@@ -585,8 +583,7 @@ def fit(
         free: what is not known well beside the glass and is fitted too, from its value in the
             scene: numbers of the scene by name, such as "ball.center", "ball.center.z",
             "screen.tile" or "camera.vertical_fov"; "gain", a factor for each channel of the
-            picture; "black", what is added to all of them. They enter the errors of the glass;
-            with numbers of the scene free all errors are too small, as the summary says.
+            picture; "black", what is added to all of them. They enter the errors of the glass.
         prior: "none"; "catalogue", a Gaussian in log B, log C over the table's glasses;
             "fixed-c3", which holds C₃ at its start.
         noise: standard deviation of the target's values where it is known; otherwise errors are
@@ -1386,19 +1383,20 @@ def _more_samples(
     """
     sigma = max(noise, CLEAN * problem.free.brightest)
     change, seen = np.abs(some.picture - few.picture), int(np.sum(some.weight.any(axis=1)))
-    told = np.max(change * some.weight, axis=1)
-    changed = np.max(change, axis=1)
+    told, changed = np.max(change * some.weight, axis=1), np.max(change, axis=1)
     if problem.free.parameters:
         # Of these an outline tells most, where the index may show hardly at all.
         told = changed = _around(problem, level.blocks, changed)
     order = np.argsort(-told)
-    # What a quarter of the samples changes tells the error of these, and that of more.
-    error, hard = changed / 3, np.zeros(len(change), bool)
+    hard, hardest = np.zeros(len(change), bool), np.zeros(len(change), bool)
     hard[order[: int(seen * REFINED[0])]] = True
+    # What a quarter of the samples changes tells the error of these, and that of more.
+    error = changed / 3
     error[hard] *= (SPLITS[0] / SPLITS[1]) ** 2
-    hardest = hard & (error > TOLERATED * sigma)
-    hardest[order[np.cumsum(hardest[order]) > seen * REFINED[1]]] = False
-    error[hardest] *= (SPLITS[1] / SPLITS[2]) ** 2
+    if problem.free.parameters:
+        hardest = hard & (error > TOLERATED * sigma)
+        hardest[order[np.cumsum(hardest[order]) > seen * REFINED[1]]] = False
+        error[hardest] *= (SPLITS[1] / SPLITS[2]) ** 2
     parts = [(~hard, SPLITS[0], 1.0)]
     for which, fewer, more in ((hard & ~hardest, *SPLITS[:2]), (hardest, *SPLITS[1:])):
         ratio = (more / fewer) ** 2
@@ -1844,7 +1842,7 @@ def _uncertainty(
         singular_values=singular,
         determined=determined,
         summary=_summary(opening, waves, n_std, determined, len(singular), source, prior, own)
-        + (UNDERSTATED if free.parameters else ""),
+        + _edges_without(level.parts[0].plan, bool(free.parameters)),
         prior=prior,
         noise=noise.sigma,
         samples=tuple(part.plan.samples * part.split**2 for part in level.parts),
@@ -1948,6 +1946,18 @@ def _covariance(
     rest[:count] = (1 / (1 + (scales * WIDEST) ** 2)) * WIDEST**2 / (1 + (scales * WIDEST) ** 2)
     spread = np.concatenate([follow, np.eye(len(z))]) @ right.T
     return whole @ within @ whole.T + (spread * rest) @ spread.T
+
+
+def _edges_without(plan: Plan, moves: bool) -> str:
+    """What to say of edges that have no derivative, if any move.
+
+    Args:
+        plan: of a render.
+        moves: whether numbers of the scene are free.
+    """
+    if plan.scattering:
+        return UNDERSTATED.format("edges of textures and outlines")
+    return UNDERSTATED.format("outlines of glass balls") if plan.nested and moves else ""
 
 
 def _line_figures(coefficients: Coefficients, z: Array) -> jax.Array:
