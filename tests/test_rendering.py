@@ -1,3 +1,6 @@
+from dataclasses import replace
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,6 +29,7 @@ from diffdisp.dispersion import Sellmeier
 from diffdisp.film import Film
 from diffdisp.geometry import Plane, Sphere
 from diffdisp.material import Dielectric, Emitter
+from diffdisp.planning import make_plan
 from diffdisp.rendering import render, render_progressively
 from diffdisp.scene import Background, Object, Scene, with_glass
 
@@ -460,6 +464,34 @@ def test_outlines_seen_through_a_ball_move_with_its_index():
     sharp = jax.jit(lambda n: picture(n, 900))
     difference = (sharp(1.502) - sharp(1.498)) / 0.004
     assert np.linalg.norm(slope - difference) < 0.05 * np.linalg.norm(difference)
+
+
+def test_soft_outlines_move_as_the_picture_does():
+    film = Film(24, 24, wavelengths=[0.55])
+
+    def swollen(by):
+        aside = eqx.tree_at(lambda s: s.objects[0].shape.center, bench(), np.array([0.01, 0.02, 0]))
+        return eqx.tree_at(lambda s: s.objects[0].shape.radius, aside, 1.0 + by)
+
+    def moved(by, soft):
+        plan = replace(make_plan(bench(), film, 64, 50, "float64"), soft=soft)
+        parts = chunks.film_spectrum(film, plan), chunks.film_size(film)
+        pixels, place = chunks.all_pixels(film, chunks.chunk_pixels(film, plan))
+        run = chunks.run_numbers(plan, 0)
+        return chunks.render_chunks(plan, swollen(by), *parts, pixels, run).reshape(-1)[place]
+
+    def sharp(by):
+        picture = render(swollen(np.array(by)), film, samples=1600, dtype="float64")
+        return picture.reshape(-1)
+
+    difference = (sharp(1e-3) - sharp(-1e-3)) / 2e-3
+    apart = []
+    for soft in (True, False):
+        push = jax.jit(lambda x, soft=soft: jax.jvp(lambda x: moved(x, soft), (x,), (x + 1,))[1])
+        found = push(jnp.zeros(()))
+        apart.append(np.linalg.norm(found - difference) / np.linalg.norm(difference))
+    # On points next to the rim the ball turns away within less than a sample's footprint.
+    assert apart[0] < 0.75 * apart[1]
 
 
 def scenes():
