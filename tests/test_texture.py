@@ -9,7 +9,6 @@ from diffdisp.texture import (
     Solid,
     as_texture,
     covered,
-    filtered_checker,
     filtered_square_wave,
 )
 
@@ -150,23 +149,6 @@ def parallelograms(axes, low, high, count=60):
     middle = RNG.uniform(-4, 4, (axes, count))
     edges = np.exp(RNG.uniform(np.log(low), np.log(high), (2, axes, count)))
     return middle, *(edges * RNG.choice([-1, 1], edges.shape))
-
-
-@pytest.mark.parametrize("axes", [2, 3])
-@pytest.mark.parametrize(("low", "high"), [(1e-3, 0.05), (0.05, 0.3)], ids=str)
-def test_mean_of_tiles_around_their_corners(axes, low, high):
-    middle, across, down = parallelograms(axes, low, high)
-    middle[:2] = np.round(middle[:2]) + RNG.uniform(-0.3, 0.3, (2, 60)) * high
-    middle[2:] = np.round(middle[2:]) + 0.5  # a corner of all three is not represented
-    found = jax.jit(jax.vmap(lambda *where: filtered_checker(*where)))(
-        tuple(middle), tuple(across), tuple(down)
-    )
-    expected = over_parallelogram(
-        lambda *x: np.prod([hard_wave(part) for part in x], axis=0), (middle, across, down)
-    )
-    np.testing.assert_allclose(found, expected, rtol=0, atol=0.01)  # of the sum: 2/400 an edge
-    apart = np.prod([WAVE(*axis) for axis in zip(middle, across, down, strict=True)], axis=0)
-    assert np.abs(apart - expected).max() > 0.2  # without its correlation a corner is far off
 
 
 def test_what_is_covered_of_a_footprint():

@@ -35,7 +35,7 @@ from diffdisp.material import Dielectric, Emitter, Lambertian, Material, Metal
 from diffdisp.planning import Plan
 from diffdisp.sampling import Numbers, uniform_direction
 from diffdisp.scene import Object, Scene, is_glass, texture_of
-from diffdisp.texture import Checker, Solid, covered, filtered_checker
+from diffdisp.texture import Checker, Solid, covered, filtered_square_wave
 from diffdisp.vector import (
     Array,
     Real,
@@ -402,7 +402,7 @@ def _is_odd(coordinates: tuple[Real, ...]) -> Array:
 def _filtered(coordinates: Callable[[Ray], tuple[Real, ...]], path: Path) -> Real:
     """The mean over a footprint of +1 in even and -1 in odd tiles."""
     values, edges = pushed(coordinates, path.ray, path.footprint)
-    return filtered_checker(values, *edges)
+    return reduce(jnp.multiply, map(filtered_square_wave, values, *edges))
 
 
 def _beneath(point: Vec3, outward: Vec3, surface: Array, tables: "Tables", plan: Plan) -> Vec3:
@@ -455,13 +455,27 @@ class Seen(NamedTuple):
 
 
 def arriving(
-    surface: Array, path: Path, tables: "Tables", plan: Plan, one: Array | None
+    surface: Array,
+    path: Path,
+    tables: "Tables",
+    plan: Plan,
+    one: Array | None,
+    clear: bool = False,
 ) -> Channels:
     """Mean radiance over a footprint whose middle meets a surface that ends paths.
 
     Lamps end at their silhouettes and infinite screens at their horizons. Of a footprint across
     such an edge each side counts by its part, the straight edge that touches the surface there
-    taken for it; of several, the nearer ones hide the others by their parts.
+    taken for it; of several, the nearer ones hide the others by their parts. Where a ball of glass
+    may be beside the edge, all counts as what the middle meets.
+
+    Args:
+        surface: what the middle meets.
+        path: ray and footprint.
+        tables: the scene.
+        plan: its static choices.
+        one: as in `once`.
+        clear: whether the footprint is known to meet no ball of glass.
     """
     ends = plan.lamps + plan.screens
     if path.footprint is None or not ends:
@@ -470,6 +484,12 @@ def arriving(
     background = plan.background - plan.balls + tables.first_row
     seen = [_lamp_seen(row, path, tables, plan, one) for row in range(plan.lamps)]
     seen += [_screen_seen(row, path, tables, plan, one) for row in range(plan.screens)]
+    if plan.balls and not clear:
+        hard = _meets_glass(path, tables.world, plan)
+        seen = [
+            found._replace(part=jnp.where(hard, jnp.where(surface == number, 1.0, 0.0), found.part))
+            for number, found in enumerate(seen, start=plan.first_lamp)
+        ]
     total = tuple(jnp.zeros_like(mean[0]) for mean in tables.paint.mean)
     rest = jnp.ones_like(path.ray.origin.x)
     for number, found in enumerate(seen):
@@ -486,6 +506,20 @@ def arriving(
     return tuple(
         t + rest * _pick(mean, background) for t, mean in zip(total, tables.paint.mean, strict=True)
     )
+
+
+def _meets_glass(path: Path, world: World, plan: Plan) -> Array:
+    """Whether a part of a footprint may meet a ball of glass, or is within one."""
+    meets = jnp.zeros(path.ray.origin.x.shape, bool)
+    assert path.footprint is not None
+    for row in range(plan.balls):
+        center, radius = vec3_row(world.centers, row), world.radii[row]
+        along, depth, edges = sphere_depth(path.ray, path.footprint, center, radius)
+        offset = path.ray.origin - center
+        # What leaves a ball starts on it, or within rounding of that.
+        within = offset.dot(offset) < radius * radius * (1.0 - 1e-5)
+        meets = meets | within | ((along > 0) & (depth + box_width(edges) > 0))
+    return meets
 
 
 def _lamp_seen(row: int, path: Path, tables: "Tables", plan: Plan, one: Array | None) -> Seen:
@@ -767,12 +801,14 @@ def _both_ways(path: Path, setting: Setting, inside: Array | bool) -> Path:
     plan, world, ball = setting.plan, setting.tables.world, path.surface
     outer, inner, differ = _parting(path, setting, inside)
     throughput, spheres = path.throughput[0], all_spheres(world, plan, setting.one)
+    # What leaves the only ball meets no glass again.
+    alone = plan.balls == 1 and not plan.nested
 
     def arrive(way: Way, radiance: Channels) -> tuple[Array, Channels]:
         """The surface that a way meets, and the radiance with what that one adds."""
         surface = nearest(way.ray, world, plan, ball, spheres, way.footprint)
         arrived = path._replace(ray=way.ray, footprint=way.footprint)
-        light = arriving(surface, arrived, setting.tables, plan, setting.one)
+        light = arriving(surface, arrived, setting.tables, plan, setting.one, alone)
         factor = jnp.where(path.alive & (surface >= plan.first_lamp), throughput * way.share, 0.0)
         return surface, tuple(r + factor * x for r, x in zip(radiance, light, strict=True))
 

@@ -1,15 +1,12 @@
 """What a surface shows at a point, averaged over the footprint of a sample."""
 
-from collections.abc import Sequence
-from functools import reduce
-from itertools import combinations
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 
 from diffdisp.dispersion import real_array
-from diffdisp.vector import Real, Triple, choose
+from diffdisp.vector import Real, Triple
 
 
 class Solid(eqx.Module):
@@ -54,101 +51,6 @@ def as_texture(value: Any) -> Texture:
     if isinstance(value, Texture):
         return value
     return Solid(value)
-
-
-def filtered_checker(middle: Sequence[Real], across: Sequence[Real], down: Sequence[Real]) -> Real:
-    """Mean over a parallelogram of +1 in even and -1 in odd tiles or cubes.
-
-    Where no corner of tiles lies in the footprint, or where its edges go along the tiles', this
-    is the product of the means along each axis. Else the axes are correlated over the footprint:
-    of each pair of them the corner next to its middle adds the covariance of being beyond its
-    two edges. Of footprints wider than a tile, which see many corners that cancel, it counts less.
-
-    Args:
-        middle: of the footprint, two or three coordinates in tiles.
-        across: what the footprint's one edge adds to each.
-        down: the same for its other edge.
-
-    Returns:
-        The mean, within about [-1, 1]; its derivatives are as those of `filtered_square_wave`.
-    """
-    waves = [filtered_square_wave(*axis) for axis in zip(middle, across, down, strict=True)]
-    mean = reduce(jnp.multiply, waves)
-    for pair in combinations(range(len(waves)), 2):
-        first, second = ((middle[axis], across[axis], down[axis]) for axis in pair)
-        others = (wave for axis, wave in enumerate(waves) if axis not in pair)
-        mean = mean + reduce(jnp.multiply, others, _corner(first, second))
-    return mean
-
-
-def _corner(first: tuple[Real, Real, Real], second: tuple[Real, Real, Real]) -> Real:
-    """What the corner next to a footprint adds to the product of two square waves' means.
-
-    It fades out before the next corner takes its place, so that nothing jumps.
-    """
-    offsets, counts, widest = [], jnp.ones_like(first[0]), jnp.zeros_like(first[0])
-    for x, across, down in (first, second):
-        edge = jnp.round(x)
-        offset, reach = x - edge, 0.5 * (jnp.abs(across) + jnp.abs(down))
-        rising = 1.0 - 2.0 * jnp.abs(edge - 2.0 * jnp.round(0.5 * edge))
-        spare = (0.5 - jnp.abs(offset)) / jnp.maximum(reach - 0.5, 1e-6)
-        counts = counts * rising * jnp.clip(spare, 0.0, 1.0)
-        offsets.append(offset)
-        widest = jnp.maximum(widest, reach)
-    counts = counts * jnp.clip(2.0 - 2.0 * widest, 0.0, 1.0)
-    return 4.0 * counts * _both_beyond((offsets[0], *first[1:]), (offsets[1], *second[1:]))
-
-
-def _both_beyond(first: tuple[Real, Real, Real], second: tuple[Real, Real, Real]) -> Real:
-    """Covariance, over a parallelogram, of two coordinates being positive.
-
-    Args:
-        first: one coordinate in its middle, and what both edges add to it.
-        second: the same of the other.
-    """
-    widest = [jnp.maximum(jnp.abs(across), jnp.abs(down)) for _, across, down in (first, second)]
-    sizes = [jnp.where(wide > 0, wide, 1.0) for wide in widest]
-    # Both have to change across the footprint; what changes only down it goes the other way round.
-    by_across, by_down = (
-        jnp.minimum(
-            *(jnp.abs(axis[k]) / size for axis, size in zip((first, second), sizes, strict=True))
-        )
-        for k in (1, 2)
-    )
-    swaps, lines, parts, sign = by_down > by_across, [], [], jnp.ones_like(first[0])
-    for (x, across, down), size in zip((first, second), sizes, strict=True):
-        part = covered(x, across, down)
-        across, down = choose(swaps, (down, across), (across, down))
-        mirror = jnp.where(across < 0, -1.0, 1.0)
-        parts.append(jnp.where(mirror < 0, 1.0 - part, part))
-        sign = sign * mirror
-        across = jnp.maximum(jnp.abs(across), SLIVER * size)
-        # The part of a line across at t, from -1/2 to 1/2 down, is this straight line cut off.
-        lines.append((mirror * x / across + 0.5, mirror * down / across))
-    # Of a footprint along the tiles the one tells nothing of the other.
-    sign = sign * jnp.minimum(jnp.maximum(by_across, by_down) * (1.0 / SLIVER), 1.0)
-    (level, slope), (other_level, other_slope) = lines
-    # Both are positive in the smaller part: before the lines cross it is that of the steeper.
-    turn = slope - other_slope
-    parallel = turn == 0
-    ahead = jnp.where(level < other_level, 0.5, -0.5) * jnp.where(turn > 0, 1.0, -1.0)
-    crossing = jnp.where(parallel, ahead, (other_level - level) / jnp.where(parallel, 1.0, turn))
-    crossing = jnp.clip(crossing, -0.5, 0.5)
-    steeper, flatter = choose(turn > 0, lines, lines[::-1])
-    both = _cut_line(steeper, -0.5, crossing) + _cut_line(flatter, crossing, 0.5)
-    return sign * (both - parts[0] * parts[1])
-
-
-def _cut_line(line: tuple[Real, Real], start: Real | float, end: Real | float) -> Real:
-    """Integral from start to end of a straight line, its level at 0 and slope, cut to [0, 1]."""
-    level, slope = line
-    first, last = level + slope * start, level + slope * end
-    low, high = jnp.clip(first, 0.0, 1.0), jnp.clip(last, 0.0, 1.0)
-    above = jnp.maximum(last, 1.0) - jnp.maximum(first, 1.0)
-    change = last - first
-    even = change == 0
-    mean = (0.5 * (high - low) * (high + low) + above) / jnp.where(even, 1.0, change)
-    return (end - start) * jnp.where(even, low, mean)
 
 
 def filtered_square_wave(x: Real, across: Real, down: Real) -> Real:
