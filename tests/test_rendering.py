@@ -427,19 +427,6 @@ def test_a_lamp_grows_smoothly_by_its_outline():
     np.testing.assert_allclose(slope, growth, rtol=1e-2)
 
 
-def test_a_horizon_sinks_smoothly_as_the_camera_looks_up():
-    ground_of = ground(Emitter([1.0] * 3))
-
-    def light(up):
-        look_at = jnp.zeros(3).at[1].set(up)
-        return summed(Scene(Camera([0.0, 0, 4], look_at, vertical_fov=34.0), (ground_of,)))
-
-    found, slope = jax.jit(jax.value_and_grad(light))(jnp.array(0.1))
-    # What is level is f tan α below the middle, tan α = 0.1 / 4.
-    np.testing.assert_allclose(found, 24 * (12 - FOCAL * 0.1 / 4), rtol=1e-3)
-    np.testing.assert_allclose(slope, -24 * FOCAL / 4, rtol=1e-3)
-
-
 def test_a_lamp_before_a_lamp_hides_it_by_its_part():
     def light(radius):
         near = Object(Sphere([0.0, 0, 1], radius), Emitter([0.25] * 3))

@@ -464,10 +464,10 @@ def arriving(
 ) -> Channels:
     """Mean radiance over a footprint whose middle meets a surface that ends paths.
 
-    Lamps end at their silhouettes and infinite screens at their horizons. Of a footprint across
-    such an edge each side counts by its part, the straight edge that touches the surface there
-    taken for it; of several, the nearer ones hide the others by their parts. Where a ball of glass
-    may be beside the edge, all counts as what the middle meets.
+    Lamps end at their silhouettes, and infinite screens at their horizons, which count where
+    outlines are soft. Of a footprint across such an edge each side counts by its part, the straight
+    edge that touches the surface there taken for it; of several, the nearer ones hide the others by
+    their parts. Where a ball of glass may be beside the edge, all counts as what the middle meets.
 
     Args:
         surface: what the middle meets.
@@ -544,7 +544,7 @@ def _lamp_seen(row: int, path: Path, tables: "Tables", plan: Plan, one: Array | 
 
 
 def _screen_seen(row: int, path: Path, tables: "Tables", plan: Plan, one: Array | None) -> Seen:
-    """A screen: all of the footprint up to its horizon, where its tiles are their mean."""
+    """A screen; where outlines are soft, up to its horizon, and there its tiles are their mean."""
     world, number = tables.world, plan.first_lamp + plan.lamps + row
     plane = plan.planes - plan.screens + row
     normal = vec3_row(world.normals, plane)
@@ -555,10 +555,16 @@ def _screen_seen(row: int, path: Path, tables: "Tables", plan: Plan, one: Array 
         return ray.direction.dot(normal) * side
 
     downward, edges = pushed(towards, path.ray, path.footprint)
-    part = jnp.where(height == 0, 0.0, covered(downward, *edges))
     meets = downward > 0
+    part = jnp.where(meets, 1.0, 0.0)
+    if plan.soft:
+        part = covered(downward, *edges)
+    part = jnp.where(height == 0, 0.0, part)
     distance = jnp.where(meets, jnp.abs(height) / jnp.where(meets, downward, 1.0), jnp.inf)
-    light = emitted(_everywhere(number, height), path, tables, plan, one)
+    shown = emitted(_everywhere(number, height), path, tables, plan, one)
+    place = number - plan.balls + tables.first_row
+    mean = (_pick(channel, place) for channel in tables.paint.mean)
+    light = tuple(jnp.where(part < 1, m, x) for x, m in zip(shown, mean, strict=True))
     return Seen(distance, part, light)
 
 
