@@ -16,7 +16,6 @@ from helpers import (
     camera,
     furnace,
     glass_of_index,
-    ground,
     incidence_on_unit_ball,
     lamp,
     reflectance,

@@ -556,7 +556,7 @@ def _screen_seen(row: int, path: Path, tables: "Tables", plan: Plan, one: Array 
 
     downward, edges = pushed(towards, path.ray, path.footprint)
     meets = downward > 0
-    part = jnp.where(meets, 1.0, 0.0)
+    part: Real = jnp.where(meets, 1.0, 0.0)
     if plan.soft:
         part = covered(downward, *edges)
     part = jnp.where(height == 0, 0.0, part)
