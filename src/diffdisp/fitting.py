@@ -701,7 +701,11 @@ def _expected(problem: Problem, prior: str, noise: float) -> Uncertainty:
     many = _level(problem, LAST, 1, FEW_SAMPLES, 50, 0, SPLITS[0])
     some = _linearise(problem, many, at, CUTOFF)
     level = _more_samples(problem, many, few, some, 50, noise)
-    seen = _linearise(problem, level, at, CUTOFF, some.columns)
+    known = some.columns
+    if problem.free.parameters:
+        finer = _level(problem, LAST, 1, FEW_SAMPLES, 50, 0, SPLITS[1])
+        known = _linearise(problem, finer, at, CUTOFF).columns
+    seen = _linearise(problem, level, at, CUTOFF, known)
     # A pixel's weight says how much of its residual is what samples leave open, beside the noise:
     # all residuals, weighed, are to be as large as the noise.
     residual = noise / np.sqrt(np.where(level.weights > 0, level.weights, 1.0))
@@ -711,8 +715,8 @@ def _expected(problem: Problem, prior: str, noise: float) -> Uncertainty:
         source += f", with what samples leave open as of {expected.sigma:.2g}"
     expected = expected._replace(source=source)
     opening = "Such a picture would fix"
-    known = _uncertainty(problem, at, level, lin, expected, prior, opening)
-    return replace(known, noise=noise)
+    told = _uncertainty(problem, at, level, lin, expected, prior, opening)
+    return replace(told, noise=noise)
 
 
 def _check_known(prior: str, noise: float | None) -> None:
@@ -957,12 +961,11 @@ def _traced(
             return chunk_lanes(plan, changed, spectrum, size, pixels, run)
 
         def of_scene(coordinates: Array) -> Array:
-            # A ball's outline moves with it; slopes of points of it are far from a pixel's.
-            soft = replace(plan, soft=not plan.nested and not plan.scattering)
-            return combine(soft, followed_radiance(soft, at(index), lanes(coordinates)), spectrum)
+            return combine(plan, followed_radiance(plan, at(index), lanes(coordinates)), spectrum)
 
         def of_index(index: Array) -> Array:
-            return combine(plan, lane_radiance(plan, at(index), lanes(coordinates)), spectrum)
+            sharp = replace(plan, soft=False)
+            return combine(sharp, lane_radiance(sharp, at(index), lanes(coordinates)), spectrum)
 
         def change(tangent: Array) -> tuple[Array, Array]:
             return jax.jvp(of_index, (index,), (tangent,))
@@ -1000,9 +1003,14 @@ def _trace(
         places, units, coordinates = (), units[:0], coordinates[:0]
     scene = without_names(scene)
 
+    # A ball's outline moves with it; slopes of points of it are far from a pixel's. Of a picture
+    # that is drawn as the target was they are the true ones all the same.
+    soft = part.split > 1 and not (part.plan.nested or part.plan.scattering)
+    plan = replace(part.plan, soft=soft and bool(places))
+
     def trace(chunks: Pixels) -> np.ndarray:
         fixed = (scene, part.spectrum, size, chunks, run, index, part.tangents)
-        return np.asarray(_traced_jit(part.plan, problem.ball, places, *fixed, coordinates, units))
+        return np.asarray(_traced_jit(plan, problem.ball, places, *fixed, coordinates, units))
 
     values = over_chunks(trace, part.chunks, "float64")
     return np.mean(values.reshape(-1, *values.shape[2:])[part.place], axis=1)
