@@ -1679,9 +1679,8 @@ def _search(problem: Problem, target: Picture) -> "tuple[Level, Descent]":
         many = _level(problem, LAST, 1, FEW_SAMPLES, depth, seed, SPLITS[0])
         best = _descend(problem, level, best.at, CUTOFF, 20, 1.0)
         level, at = _refined(problem, best, many, depth)
-        # Slopes next to an outline are steep too.
-        finer = _level(problem, LAST, 1, FEW_SAMPLES, depth, seed, SPLITS[1])
-        along = finer if problem.free.parameters else None
+        if problem.free.parameters:  # slopes next to an outline are steep too
+            along = _level(problem, LAST, 1, FEW_SAMPLES, depth, seed, SPLITS[1])
     else:
         level, at = _level(problem, LAST, 1, target.samples, depth, seed), best.at
     best = _descend(problem, level, at, CUTOFF, 30, LINEAR_STEP, along)

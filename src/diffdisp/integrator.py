@@ -477,10 +477,9 @@ def arriving(
         one: as in `once`.
         clear: whether the footprint is known to meet no ball of glass.
     """
-    ends = plan.lamps + plan.screens
-    if path.footprint is None or not ends:
+    edges = plan.lamps or (plan.soft and plan.screens)
+    if path.footprint is None or not edges:
         return emitted(surface, path, tables, plan, one)
-    # Behind all is the background; it starts to be hidden from the nearest one on.
     background = plan.background - plan.balls + tables.first_row
     seen = [_lamp_seen(row, path, tables, plan, one) for row in range(plan.lamps)]
     seen += [_screen_seen(row, path, tables, plan, one) for row in range(plan.screens)]
