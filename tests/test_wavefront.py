@@ -87,6 +87,11 @@ def test_another_size_seed_or_number_of_passes_compiles_nothing():
     assert len(programs._READY) == before
 
 
+def test_every_bit_of_a_word_is_found():
+    bits = np.uint32(1) << np.arange(32, dtype=np.uint32)
+    assert np.array_equal(wavefront._bit_number(bits), np.arange(32))
+
+
 def test_the_background_alone_is_drawn_without_paths():
     view = Camera((0, 0, 4), (0, 0, 9), vertical_fov=30.0)
     scene = Scene(view, (matte(0.5),), Background((0.2, 0.4, 0.6)))
