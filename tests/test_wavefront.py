@@ -4,6 +4,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import colour
+import jax
 import numpy as np
 import pytest
 from helpers import BK7, N_D, WHITE, ball, direct, matte
@@ -89,7 +90,7 @@ def test_another_size_seed_or_number_of_passes_compiles_nothing():
 
 def test_every_bit_of_a_word_is_found():
     bits = np.uint32(1) << np.arange(32, dtype=np.uint32)
-    assert np.array_equal(wavefront._bit_number(bits), np.arange(32))
+    assert np.array_equal(jax.vmap(wavefront._bit_number)(bits), np.arange(32))
 
 
 def test_the_background_alone_is_drawn_without_paths():

@@ -1111,7 +1111,7 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
     )
 
 
-FOLLOWED = 8.0
+FOLLOWED = 4.0
 """How much more often a reflected path is followed than light goes its way: noise against time."""
 
 

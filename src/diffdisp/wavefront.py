@@ -497,16 +497,16 @@ def _advance(lane: Lane, plan: Plan, view: View, samples: FilmSamples, hits: Arr
     lane = once(lambda: _next_sample(lane, plan, view, samples, hits))
     numbers, pixel = _numbers(plan, view), _pixel_number(view, lane.x, lane.y)
     word = look_up(samples.number, lane.sample)
-    row: Array | int = 0
-    wave: Array | int = 0
+    place: Array | int = 0
     weights = always = split = None
     if samples.weights is not None:
         assert lane.wave is not None
         assert lane.way is not None
         assert samples.ratios is not None
-        row, wave = lane.sample, lane.wave
-        weights = tuple(look_up(channel, row, wave) for channel in samples.weights)
-        always = jnp.asarray(wave == 0)
+        # Tables are looked up by one number: two would be put into an array of pairs first.
+        place = lane.sample * samples.indices.shape[1] + lane.wave
+        weights = tuple(look_up(channel.reshape(-1), place) for channel in samples.weights)
+        always = jnp.asarray(lane.wave == 0)
         ball = jnp.minimum(lane.path.surface, plan.balls - 1)
         split = Split(
             (lane.way != NO_GLASS) & (lane.path.last < 0),
@@ -517,7 +517,7 @@ def _advance(lane: Lane, plan: Plan, view: View, samples: FilmSamples, hits: Arr
         Tables(view.world, view.paint),
         plan,
         lambda bounces, decision: numbers.of_bounce(pixel, word, bounces, decision),
-        lambda ball: look_up(samples.indices, row, wave, ball),
+        lambda ball: look_up(samples.indices.reshape(-1), place * plan.balls + ball),
         weights,
         always,
         split,
