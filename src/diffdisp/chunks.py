@@ -55,7 +55,7 @@ class RunNumbers(NamedTuple):
 
     seed: np.ndarray
     cutoff: np.ndarray
-    one: np.ndarray
+    one: jax.Array | np.ndarray
     number: np.ndarray
     right: np.ndarray
     down: np.ndarray
@@ -413,6 +413,7 @@ def render_chunks(
     run: RunNumbers,
 ) -> Float[jax.Array, "chunks pixels channels"]:
     """Mean radiance of each pixel, one chunk after another."""
+    run = run._replace(one=_unknown_one(run.one, scene))
     scene, spectrum, size, chunks, run = in_dtype((scene, spectrum, size, chunks, run), plan.dtype)
     indices = glass_indices(scene, spectrum.wavelengths)
 
@@ -421,6 +422,19 @@ def render_chunks(
         return combine(plan, lane_radiance(plan, indices, lanes), spectrum)
 
     return each_chunk(chunk, chunks)
+
+
+def _unknown_one(one: Array, scene: Scene) -> Array:
+    """The 1, or another positive number, as no compiler knows it.
+
+    In a program of the user's own the 1 is a constant; then what is traced of the scene makes one.
+    """
+    leaves = [one, *jax.tree.leaves(scene)]
+    traced = next((leaf for leaf in leaves if isinstance(leaf, jax.core.Tracer)), None)
+    if traced is None or traced is one:
+        return one
+    number = jax.lax.stop_gradient(jnp.ravel(traced)[0]).astype(jnp.float32)
+    return jnp.maximum(jax.lax.bitcast_convert_type(number, jnp.int32), 1)
 
 
 def each_chunk(chunk: Callable[[Pixels], Array], chunks: Pixels) -> jax.Array:

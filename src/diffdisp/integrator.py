@@ -331,8 +331,9 @@ Channels = tuple[Real, ...]
 
 def painted(
     surface: Array,
-    point: Callable[[Ray], Vec3],
-    path: Path,
+    point: Callable[[Any], Vec3],
+    met: Any,
+    edges: tuple[Any, Any] | None,
     tables: "Tables",
     plan: Plan,
     emits: bool,
@@ -342,8 +343,9 @@ def painted(
 
     Args:
         surface: its number.
-        point: from the ray to where it meets the surface; a little beneath it.
-        path: ray and footprint.
+        point: from `met` to where the ray meets the surface; a little beneath it.
+        met: what tells that.
+        edges: the derivatives of `met` along both edges of a footprint, if there is one.
         tables: the scene.
         plan: its static choices.
         emits: whether the surface ends paths, as all those do that are asked for here.
@@ -361,30 +363,30 @@ def painted(
     if not (tiled or cubed):
         return tuple(_pick(channel, place) for channel in mean)
     scale = _pick(paint.scale, row)
-    waves: list[Callable[[Ray], tuple[Real, ...]]] = []
+    waves: list[Callable[[Any], tuple[Real, ...]]] = []
     if tiled:
         plane = _plane_row(surface, plan)
 
-        def on_tiles(ray: Ray) -> tuple[Real, ...]:
-            offset = point(ray) - _pick_vector(tables.world.points, plane)
+        def on_tiles(met: Any) -> tuple[Real, ...]:
+            offset = point(met) - _pick_vector(tables.world.points, plane)
             u, v = (_pick_vector(axis, plane) for axis in tables.world.axes)
             return offset.dot(u) * scale, offset.dot(v) * scale
 
         waves.append(on_tiles)
     if cubed:
-        waves.append(lambda ray: tuple(point(ray) * scale))
+        waves.append(lambda met: tuple(point(met) * scale))
     is_cubes = _pick(paint.cubes, row) if tiled and cubed else None
-    if path.footprint is None:
+    if edges is None:
 
         def row_of_both() -> Array:
-            odd = _one_of([_is_odd(wave(path.ray)) for wave in waves], is_cubes)
+            odd = _one_of([_is_odd(wave(met)) for wave in waves], is_cubes)
             return place + jnp.where(odd, mean[0].shape[0], 0)
 
         # Even and odd rows in one table: a look-up costs more than all else here.
         place = once(row_of_both, one)
         both = (jnp.concatenate([m + h, m - h]) for m, h in zip(mean, half, strict=True))
         return tuple(_pick(channel, place) for channel in both)
-    mix = once(lambda: _one_of([_filtered(wave, path) for wave in waves], is_cubes), one)
+    mix = _one_of([_filtered(wave, met, edges, one) for wave in waves], is_cubes)
     return tuple(_pick(m, place) + _pick(h, place) * mix for m, h in zip(mean, half, strict=True))
 
 
@@ -399,10 +401,16 @@ def _is_odd(coordinates: tuple[Real, ...]) -> Array:
     return jnp.asarray(cells != 2.0 * jnp.floor(0.5 * cells))
 
 
-def _filtered(coordinates: Callable[[Ray], tuple[Real, ...]], path: Path) -> Real:
+def _filtered(
+    coordinates: Callable[[Any], tuple[Real, ...]],
+    met: Any,
+    edges: tuple[Any, Any],
+    one: Array | None,
+) -> Real:
     """The mean over a footprint of +1 in even and -1 in odd tiles."""
-    values, edges = pushed(coordinates, path.ray, path.footprint)
-    return reduce(jnp.multiply, map(filtered_square_wave, values, *edges))
+    values, reaches = once(lambda: pushed(coordinates, met, edges), one)
+    waves = zip(values, *reaches, strict=True)
+    return reduce(jnp.multiply, [once(partial(filtered_square_wave, *w), one) for w in waves])
 
 
 def _beneath(point: Vec3, outward: Vec3, surface: Array, tables: "Tables", plan: Plan) -> Vec3:
@@ -423,21 +431,35 @@ def emitted(
     on_lamp = (surface >= plan.first_lamp) & (surface < plan.first_lamp + plan.lamps)
     on_screen = (surface >= plan.first_lamp + plan.lamps) & (surface < plan.background)
 
-    def point(ray: Ray) -> Vec3:
-        where, outward = ray.origin, ray.direction
+    def reach(ray: Ray) -> Real:
+        distance = jnp.zeros_like(ray.origin.x)
         if plan.screens:
-            found = _on_plane(ray, plane, on_screen, world)
-            where = choose(on_screen, found, where)
+            distance = jnp.where(on_screen, _to_plane(ray, plane, on_screen, world), distance)
+        if plan.lamps and plan.cubed[True]:
+            near, far, _ = sphere_distances(ray, *lamp())
+            distance = jnp.where(on_lamp, jnp.where(near > 0, near, far), distance)
+        return distance
+
+    def point(met: tuple[Ray, Real]) -> Vec3:
+        ray, distance = met
+        where, outward = ray.origin + ray.direction * distance, ray.direction
+        if plan.screens:
             outward = choose(on_screen, _pick_vector(world.normals, plane), outward)
         if plan.lamps and plan.cubed[True]:
-            center, radius = _pick_vector(world.centers, sphere), _pick(world.radii, sphere)
-            near, far, _ = sphere_distances(ray, center, radius)
-            found = ray.origin + ray.direction * jnp.where(near > 0, near, far)
-            where = choose(on_lamp, found, where)
-            outward = choose(on_lamp, (found - center) * (1.0 / radius), outward)
+            center, radius = lamp()
+            outward = choose(on_lamp, (where - center) * (1.0 / radius), outward)
         return _beneath(where, outward, surface, tables, plan)
 
-    return painted(surface, point, path, tables, plan, True, one)
+    def lamp() -> tuple[Vec3, Real]:
+        return _pick_vector(world.centers, sphere), _pick(world.radii, sphere)
+
+    if path.footprint is None:
+        return painted(
+            surface, lambda ray: point((ray, reach(ray))), path.ray, None, tables, plan, True, one
+        )
+    distance, gains = once(lambda: pushed(reach, path.ray, path.footprint), one)
+    across, down = zip(path.footprint, gains, strict=True)
+    return painted(surface, point, (path.ray, distance), (across, down), tables, plan, True, one)
 
 
 class Seen(NamedTuple):
@@ -581,12 +603,11 @@ def _plane_row(surface: Array, plan: Plan) -> Array:
     return jnp.clip(row, 0, max(plan.planes - 1, 0))
 
 
-def _on_plane(ray: Ray, plane: Array, valid: Array, world: World) -> Vec3:
-    """Where a ray that is known to meet a plane meets it."""
+def _to_plane(ray: Ray, plane: Array, valid: Array, world: World) -> Real:
+    """Distance along a ray to a plane that it is known to meet."""
     point, normal = _pick_vector(world.points, plane), _pick_vector(world.normals, plane)
     cosine = jnp.where(valid, ray.direction.dot(normal), 1.0)
-    distance = (point - ray.origin).dot(normal) / cosine
-    return ray.origin + ray.direction * distance
+    return (point - ray.origin).dot(normal) / cosine
 
 
 class Tables(NamedTuple):
@@ -856,21 +877,25 @@ def _parting(path: Path, setting: Setting, inside: Array | bool) -> tuple[Way, W
     def stage(of: Callable[[Any], Any], value: Any, *edges: Any) -> tuple[Any, Any]:
         return once(lambda: pushed(of, value, edges), setting.one)
 
-    width = None
+    old, changes = path.ray.direction, tuple(edge.direction for edge in path.footprint)
     if plan.soft:
         width = box_width(sphere_depth(path.ray, path.footprint, center, radius)[2])
-
-    def meet(ray: Ray) -> tuple[Vec3, Vec3]:
-        if width is not None:
-            offset = soft_offset(ray, center, radius, width, inside)
-            return offset, normalize(offset)
-        distance = _distance_to_ball(ray, center, radius, plan, inside)
-        outward = normalize(ray.origin + ray.direction * distance - center)
-        return outward * radius, outward
-
-    old, changes = path.ray.direction, tuple(edge.direction for edge in path.footprint)
-    (offset, outward), moves = stage(meet, path.ray, *path.footprint)
-    turns = tuple(turn for _, turn in moves)
+        offset, moves = stage(
+            lambda ray: soft_offset(ray, center, radius, width, inside), path.ray, *path.footprint
+        )
+        outward, turns = stage(normalize, offset, *moves)
+    else:
+        distance, gains = stage(
+            lambda ray: _distance_to_ball(ray, center, radius, plan, inside),
+            path.ray,
+            *path.footprint,
+        )
+        outward, turns = stage(
+            lambda met: normalize(met[0].origin + met[0].direction * met[1] - center),
+            (path.ray, distance),
+            *zip(path.footprint, gains, strict=True),
+        )
+        offset, moves = outward * radius, tuple(turn * radius for turn in turns)
     both_turn = tuple(zip(changes, turns, strict=True))
     cosine, tilts = stage(lambda vectors: vectors[0].dot(vectors[1]), (old, outward), *both_turn)
     # A border within glass, or a camera there, shows its side only here.
@@ -901,10 +926,10 @@ def _parting(path: Path, setting: Setting, inside: Array | bool) -> tuple[Way, W
 
     given, pushes = (old, outward, both_weights), zip(changes, turns, weighed, strict=True)
     (outer, inner), (across, down) = stage(directions, given, *pushes)
-    point, at = center + offset, tuple(move for move, _ in moves)
+    point = center + offset
 
     def way(direction: Vec3, number: int, share: Real) -> Way:
-        footprint = Ray(at[0], across[number]), Ray(at[1], down[number])
+        footprint = Ray(moves[0], across[number]), Ray(moves[1], down[number])
         return Way(Ray(point, direction), footprint, share)
 
     return way(outer, 0, share), way(inner, 1, 1.0 - share), differ
@@ -1082,7 +1107,9 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
         if plan.fuzzy:
             goes_on = is_matte | is_glass | (direction.dot(facing) > 0)
         sunk = _beneath(point, outward, surface, setting.tables, plan)
-        albedo = painted(surface, lambda _: sunk, path, setting.tables, plan, False, setting.one)
+        albedo = painted(
+            surface, lambda at: at, sunk, None, setting.tables, plan, False, setting.one
+        )
         throughput = tuple(
             t * jnp.where(is_glass, 1.0, a) for t, a in zip(path.throughput, albedo, strict=True)
         )
@@ -1189,7 +1216,7 @@ def _meet(path: Path, setting: Setting) -> tuple[Vec3, Vec3, Real]:
         if plan.matte_planes + plan.metal_planes:
             plane, on_plane = _plane_row(surface, plan), surface >= rows
             normal = _pick_vector(world.normals, plane)
-            flat = _on_plane(ray, plane, on_plane, world)
+            flat = ray.origin + ray.direction * _to_plane(ray, plane, on_plane, world)
             flat = flat - normal * (flat - _pick_vector(world.points, plane)).dot(normal)
             point, outward = choose(
                 on_plane, (flat, normal), (point, outward) if rows else (flat, normal)
@@ -1547,7 +1574,7 @@ def _to_the_end(
     return jnp.stack(ended.radiance, axis=-1).reshape(waves, samples, pixels, -1)
 
 
-BLOCK = 1024
+BLOCK = 512
 """Paths of a chunk that advance together on a processor core."""
 
 
