@@ -288,7 +288,7 @@ def test_a_picture_of_another_renderer():
     assert abs(result.n_d - float(truth.n_d)) <= 3 * result.n_d_std
     assert abs(result.V_d - float(truth.V_d)) <= 3 * result.V_d_std
     assert result.nearest_glasses[0][0] == "N-BK7"
-    assert result.samples == (16, 16, 64)  # the file does not say its own
+    assert result.samples == (16, 16, 256)  # the file does not say its own
 
 
 # --- colour
