@@ -152,7 +152,7 @@ def parallelograms(axes, low, high, count=60):
 
 
 def test_what_is_covered_of_a_footprint():
-    distance, across, down = (part[0] for part in parallelograms(1, 1, 8))
+    distance, across, down = (part[0] for part in parallelograms(1, 0.1, 8, 200))
     found = jax.vmap(covered)(distance, across, down)
     expected = over_parallelogram(lambda x: x > 0, (distance[None], across[None], down[None]))
     np.testing.assert_allclose(found, expected, rtol=0, atol=3e-3)  # of the sum: 1/400

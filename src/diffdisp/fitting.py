@@ -72,7 +72,7 @@ those around an outline. With `FEW_SAMPLES` in each part that is 16, 64 and 1024
 one program."""
 
 OF_GLASS_ALONE = 8
-"""The second of these where nothing but the glass is free: 256 samples. With 64, n of the bench in
+"""The second of these where no number of the scene is free: 256 samples. With 64, n of the bench in
 48² pixels and 8 bands is off by half of what a noise of 1 % makes uncertain, with 256 by a
 twentieth."""
 

@@ -544,16 +544,17 @@ def _next_sample(lane: Lane, plan: Plan, view: View, samples: FilmSamples, hits:
     """The lane with the path of its next sample or wavelength, where the present one has ended."""
     waves = samples.indices.shape[1]
 
-    def which() -> tuple[Array, Array, Array, Array]:
+    def following() -> tuple[Array, Array, Array]:
+        """The bit of the next sample, whether the present one goes on, and which comes."""
         lowest = lane.waiting & (~lane.waiting + np.uint32(1))
         again = _splits(lane, waves)
-        return lowest, again, jnp.where(again, lane.sample, _bit_number(lowest)), lane.slot
+        return lowest, again, jnp.where(again, lane.sample, _bit_number(lowest))
 
-    lowest, again, sample, slot = once(which)
+    lowest, again, sample = once(following)
     starts = ~lane.path.alive & (again | (lane.waiting != 0))
     ray = _sample_ray(plan, view, samples, lane.x, lane.y, sample)
     pixels = hits.shape[0] // plan.samples
-    surface = look_up(hits, jax.lax.rem(slot, np.int32(pixels)) * plan.samples + sample)
+    surface = look_up(hits, jax.lax.rem(lane.slot, np.int32(pixels)) * plan.samples + sample)
     path = new_path(ray, None, surface, plan)._replace(radiance=lane.path.radiance)
     new = lane._replace(
         waiting=jnp.where(again, lane.waiting, lane.waiting & ~lowest), sample=sample, path=path
