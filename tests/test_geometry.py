@@ -135,7 +135,7 @@ def test_gradients_by_hand(x):
 def first(origins, directions, center, radius, on=False):
     """`first_distance` of many rays (N, 3), in the dtype of the arrays."""
     rays = Ray(Vec3(*jnp.asarray(origins).T), Vec3(*jnp.asarray(directions).T))
-    sphere = vec3(jnp.asarray(center)), jnp.asarray(radius)
+    sphere = vec3(jnp.asarray(center)), jnp.square(jnp.asarray(radius))
     one = jax.vmap(lambda r: first_distance(r, *sphere, jnp.asarray(on)))
     return [np.asarray(part) for part in jax.jit(one)(rays)]
 
@@ -261,7 +261,7 @@ def test_first_point_of_a_far_small_sphere_in_float32():
 def first_of(x, z, radius, on):
     """The distance for a ray along -z beside the axis."""
     start = Ray(Vec3(x, jnp.zeros(()), z), vec3(jnp.array([0, 0, -1.0])))
-    return first_distance(start, vec3(jnp.zeros(3)), radius, on)[0]
+    return first_distance(start, vec3(jnp.zeros(3)), radius * radius, on)[0]
 
 
 FIRST_FORWARD = jax.jit(jax.jacfwd(first_of, argnums=(0, 1, 2)))

@@ -9,7 +9,6 @@ from diffdisp.sampling import (
     DIMENSIONS,
     Numbers,
     circle,
-    low_discrepancy,
     mixed,
     sample_grid,
     sequence_steps,
@@ -19,13 +18,24 @@ from diffdisp.sampling import (
 STEPS = sequence_steps(50)
 
 
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def bounce_numbers(per_bounce, decision, dtype, pixel, sample, bounce, seed):
+    """The numbers of many samples."""
+    numbers = Numbers(per_bounce, seed, dtype)
+    start = numbers.start(pixel)
+    return jax.vmap(lambda s: numbers.of_bounce(start, s, bounce, decision))(sample)
+
+
+def drawn(bounce, decision, pixel=3, count=1000, seed=0, per_bounce=5):
+    """The first `count` numbers of a pixel for one decision of a bounce."""
+    pixel, seed, bounce = (np.asarray(word, np.uint32) for word in (pixel, seed, bounce))
+    sample, dtype = np.arange(count, dtype=np.uint32), jnp.result_type(float).name
+    return np.asarray(bounce_numbers(per_bounce, decision, dtype, pixel, sample, bounce, seed))
+
+
 def points(pixel, count, dimension, seed=0):
     """The first `count` numbers of a pixel in one dimension."""
-    words = [jnp.asarray(v, jnp.uint32) for v in (pixel, dimension, STEPS[dimension], seed)]
-    sample = jnp.arange(count, dtype=jnp.uint32)
-    dtype = jnp.result_type(float).name
-    each = jax.vmap(partial(low_discrepancy, dtype=dtype), (None, 0, None, None, None))
-    return np.asarray(each(words[0], sample, *words[1:]))
+    return drawn(dimension, -3, pixel, count, seed, per_bounce=1)
 
 
 def star_discrepancy(u):
@@ -116,22 +126,6 @@ def test_steps_are_fractions_of_roots_of_primes():
 # --- the numbers of a path
 
 
-@partial(jax.jit, static_argnums=(0, 1))
-def bounce_numbers(per_bounce, decision, pixel, sample, bounce, seed):
-    """The numbers of many samples."""
-    numbers = Numbers(per_bounce, seed, "float64")
-    return jax.vmap(lambda s: numbers.of_bounce(pixel, s, bounce, decision))(sample)
-
-
-def drawn(bounce, decision, pixel=3, count=1000, seed=0, per_bounce=5):
-    """The first `count` numbers of a pixel for one decision of a bounce."""
-    words = [np.asarray(v, np.uint32) for v in (pixel, seed)]
-    sample = np.arange(count, dtype=np.uint32)
-    return np.asarray(
-        bounce_numbers(per_bounce, decision, words[0], sample, np.asarray(bounce), words[1])
-    )
-
-
 def test_equal_keys_draw_equal_numbers():
     np.testing.assert_array_equal(drawn(2, 1), drawn(2, 1))
     np.testing.assert_array_equal(drawn(2, 1)[:10], drawn(2, 1, count=10))
@@ -144,10 +138,9 @@ def test_equal_keys_draw_equal_numbers():
 def test_a_films_numbers_are_no_bounces():
     word = jnp.zeros((), jnp.uint32)
     numbers = Numbers(5, word, "float64")
-    film = [float(numbers.of_film(word, word, axis)) for axis in (0, 1, 2)]
-    bounces = [
-        float(numbers.of_bounce(word, word, jnp.asarray(b), d)) for b in (0, 1) for d in range(5)
-    ]
+    key = numbers.start(word), word
+    film = [float(numbers.of_film(*key, axis)) for axis in (0, 1, 2)]
+    bounces = [float(numbers.of_bounce(*key, jnp.asarray(b), d)) for b in (0, 1) for d in range(5)]
     assert len({*film, *bounces}) == 13
 
 

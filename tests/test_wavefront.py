@@ -90,7 +90,7 @@ def test_another_size_seed_or_number_of_passes_compiles_nothing():
 
 def test_every_bit_of_a_word_is_found():
     bits = np.uint32(1) << np.arange(32, dtype=np.uint32)
-    assert np.array_equal(jax.vmap(wavefront._bit_number)(bits), np.arange(32))
+    assert np.array_equal(wavefront._bit_number(bits), np.arange(32))
 
 
 def test_the_background_alone_is_drawn_without_paths():
@@ -166,7 +166,7 @@ def test_the_same_numbers_make_the_same_paths():
 
 @pytest.mark.parametrize(
     ("scene", "film", "samples", "seeds"),
-    [(ROOM, Film(96, 72), 32, 16), (GLASS, SMALL, 256, 8)],
+    [(ROOM, Film(128, 96), 32, 16), (GLASS, SMALL, 256, 8)],
     ids=["room", "dispersive"],
 )
 def test_both_loops_expect_the_same(scene, film, samples, seeds):
@@ -174,8 +174,8 @@ def test_both_loops_expect_the_same(scene, film, samples, seeds):
     one = runs(render, scene, film, range(seeds), **options)
     other = runs(direct, scene, film, range(100, 100 + seeds), **options)
     z = scores(one, other)
-    # Some 100 blocks of three channels that are alike: the mean of their z is known to 0.1, their
-    # spread to 0.07; of 8 runs each it is √(14/12) = 1.08. Where glass disperses, both take some
+    # Some 100 or 200 blocks of three channels that are alike: the mean of their z is known to 0.1,
+    # their spread to 0.07 or 0.05; of 8 runs each it is √(14/12) = 1.08. Where glass disperses, both take some
     # hundred wavelengths, but not the same: 256 samples make of that less than the noise.
     assert abs(z.mean()) < 0.15
     assert 0.8 < z.std() < 1.2

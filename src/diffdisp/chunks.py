@@ -351,7 +351,9 @@ def chunk_lanes(
         if plan.scattering:  # what is not averaged over the cell is seen at a point of it
             numbers = Numbers(plan.numbers_per_bounce, run.seed, plan.dtype)
             by_pixel = jax.vmap(numbers.of_film, (0, None, None))
-            within = jax.vmap(by_pixel, (None, 0, None))(pixels.number, run.number, axis)
+            within = jax.vmap(by_pixel, (None, 0, None))(
+                numbers.start(pixels.number), run.number, axis
+            )
         return pixels.size * (edges[:, None] + within * run.cell[axis])
 
     return Lanes(

@@ -50,7 +50,7 @@ def sphere_distances(ray: Ray, center: Vec3, radius: Real) -> tuple[Real, Real, 
     return jnp.minimum(q, other), jnp.maximum(q, other), discriminant > least
 
 
-def first_distance(ray: Ray, center: Vec3, radius: Real, on: Array) -> tuple[Real, Array]:
+def first_distance(ray: Ray, center: Vec3, squared_radius: Real, on: Array) -> tuple[Real, Array]:
     """Distance along the ray to the first point of a sphere ahead of it, and whether there is one.
 
     A ray that starts on the sphere, or within rounding of it as where two surfaces touch, meets it
@@ -59,7 +59,7 @@ def first_distance(ray: Ray, center: Vec3, radius: Real, on: Array) -> tuple[Rea
     Args:
         ray: the ray.
         center: the sphere's.
-        radius: the sphere's.
+        squared_radius: the sphere's.
         on: whether the ray is known to start on the sphere.
 
     Source:
@@ -68,9 +68,11 @@ def first_distance(ray: Ray, center: Vec3, radius: Real, on: Array) -> tuple[Rea
     to_origin = ray.origin - center
     b = -to_origin.dot(ray.direction)
     foot = to_origin + ray.direction * b
-    squared, inside = to_origin.dot(to_origin), radius * radius
+    squared, inside = to_origin.dot(to_origin), squared_radius
     discriminant = inside - foot.dot(foot)
-    root = safe_sqrt(discriminant, least_square(b) * inside)
+    # A limit would be a number of the sphere alone, for which XLA makes a loop of its own.
+    meets = discriminant * (1.0 / least_square(b)) > inside
+    root = jnp.where(meets, jnp.sqrt(jnp.where(meets, discriminant, 1.0)), 0.0)
     product = squared - inside
     margin = (squared + inside) * (1e-13 if jnp.result_type(b) == jnp.float64 else 4e-7)
     product = jnp.where(on | (jnp.abs(product) <= margin), 0.0, product)
@@ -81,7 +83,7 @@ def first_distance(ray: Ray, center: Vec3, radius: Real, on: Array) -> tuple[Rea
     divisor = jnp.where(b < 0, b - root, sum_ahead)
     quotient = product / jnp.where(divisor == 0, 1.0, divisor)
     distance = jnp.where(divide, quotient, sum_ahead)
-    return distance, (discriminant > 0) & (distance > 0)
+    return distance, meets & (distance > 0)
 
 
 def sphere_depth(

@@ -78,7 +78,7 @@ class Paint(NamedTuple):
 
 
 class Path(NamedTuple):
-    """One path on its way to a surface that sends it on.
+    """A path, or one in each of many lanes, on its way to a surface that sends it on.
 
     `footprint` and `spectral` are None where nothing is integrated over the one, and where no
     weight waits for the first dispersive glass. So is `reflected`: what the path counts that is
@@ -87,11 +87,11 @@ class Path(NamedTuple):
 
     ray: Ray
     footprint: tuple[Ray, Ray] | None
-    surface: Int[Array, ""]
-    last: Int[Array, ""]
+    surface: Int[Array, "..."]
+    last: Int[Array, "..."]
     throughput: tuple[Real, ...]
     radiance: tuple[Real, ...]
-    bounces: Int[Array, ""]
+    bounces: Int[Array, "..."]
     alive: Array
     spectral: Array | None
     reflected: Real | None
@@ -250,6 +250,7 @@ def nearest(
     ray, world, centers, radii, footprint = jax.lax.stop_gradient(
         (ray, world, spheres.centers, spheres.radii, footprint)
     )
+    squares = radii * radii
     word = jnp.int64 if plan.dtype == "float64" else jnp.int32
     rows = np.asarray((1 << max(spheres.group - 1, 0).bit_length()) - 1, word)
 
@@ -263,10 +264,10 @@ def nearest(
         words = []
         for row in range(spheres.group):
             place = group * spheres.group + row
-            center, radius = _pick_vector(centers, place), radii[place]
-            number = spheres.numbers[place]
-            distance, meets = first_distance(ray, center, radius, number == last)
+            center, number = _pick_vector(centers, place), spheres.numbers[place]
+            distance, meets = first_distance(ray, center, squares[place], number == last)
             if footprint is not None and plan.soft:
+                radius = radii[place]
                 along, depth, edges = sphere_depth(ray, footprint, center, radius)
                 grazes = (depth <= 0) & (depth + 0.5 * box_width(edges) > 0) & (along > 0)
                 grazes = grazes & (number < plan.balls) & (number != last)
@@ -279,7 +280,7 @@ def nearest(
         closer = found < best[0]
         return jnp.where(closer, found, best[0]), jnp.where(closer, group, best[1])
 
-    none = jax.lax.bitcast_convert_type(jnp.full_like(ray.origin.x, jnp.inf), word)
+    none = jax.lax.bitcast_convert_type(jnp.full_like(ray.direction.x, jnp.inf), word)
     best: Array = none
     group: Array = jnp.zeros_like(last)
     if spheres.group and not spheres.several:
@@ -432,7 +433,7 @@ def emitted(
     on_screen = (surface >= plan.first_lamp + plan.lamps) & (surface < plan.background)
 
     def reach(ray: Ray) -> Real:
-        distance = jnp.zeros_like(ray.origin.x)
+        distance = jnp.zeros_like(ray.direction.x)
         if plan.screens:
             distance = jnp.where(on_screen, _to_plane(ray, plane, on_screen, world), distance)
         if plan.lamps and plan.cubed[True]:
@@ -1202,7 +1203,7 @@ def _meet(path: Path, setting: Setting) -> tuple[Vec3, Vec3, Real]:
     def to_sphere() -> tuple[Vec3, Real, Real]:
         row = jnp.minimum(surface, rows - 1)
         center, radius = _pick_vector(world.centers, row), _pick(world.radii, row)
-        distance, _ = first_distance(ray, center, radius, path.last == surface)
+        distance, _ = first_distance(ray, center, radius * radius, path.last == surface)
         return center, radius, distance
 
     sphere = once(to_sphere, setting.one) if rows else None
@@ -1527,6 +1528,7 @@ def _to_the_end(
 ) -> Float[Array, "wavelengths samples pixels channels"]:
     """The radiance of the paths (J, S, P), followed to their ends."""
     numbers = Numbers(plan.numbers_per_bounce, lanes.seed, plan.dtype)
+    starts = numbers.start(lanes.pixel)
     waves, samples, pixels = paths.alive.shape
     rows = tables.paint.mean[0].shape[0] // waves
     index = jnp.stack(indices, axis=-1) if indices else None
@@ -1538,7 +1540,7 @@ def _to_the_end(
         wave, sample, pixel = lane // (samples * pixels), lane // pixels % samples, lane % pixels
 
         def draw(bounces: Array, decision: int) -> Real:
-            words = look_up(lanes.pixel, pixel), look_up(lanes.sample, sample)
+            words = look_up(starts, pixel), look_up(lanes.sample, sample)
             return numbers.of_bounce(*words, bounces, decision)
 
         def index_of(ball: Array | int) -> Real:

@@ -66,28 +66,34 @@ class Numbers:
     seed: Array
     dtype: str
 
-    def of_film(self, pixel: Array, sample: Array, axis: int) -> Real:
-        """A number for a sample: 0 and 1, where in its cell of the film it lies; 2 is free."""
-        return self._number(pixel, sample, jnp.asarray(axis, jnp.uint32))
+    def start(self, pixel: Array) -> Array:
+        """The word from which a pixel's numbers start; `pixel` is its number, uint32."""
+        return mixed(pixel ^ mixed(self.seed))
 
-    def of_bounce(self, pixel: Array, sample: Array, bounce: Array, decision: int) -> Real:
+    def of_film(self, start: Array, sample: Array, axis: int) -> Real:
+        """A number for a sample: 0 and 1, where in its cell of the film it lies; 2 is free."""
+        return self._number(start, sample, jnp.asarray(axis, jnp.uint32))
+
+    def of_bounce(self, start: Array, sample: Array, bounce: Array, decision: int) -> Real:
         """The number for a decision of a bounce.
 
         Args:
-            pixel: number of the pixel in the picture, uint32.
+            start: the pixel's.
             sample: number of the sample in the pixel, uint32.
             bounce: how many bounces the path has behind it.
             decision: which of the bounce's decisions.
         """
         word = bounce.astype(jnp.uint32) * np.uint32(self.per_bounce)
-        return self._number(pixel, sample, word + np.uint32(3 + decision))
+        return self._number(start, sample, word + np.uint32(3 + decision))
 
-    def _number(self, pixel: Array, sample: Array, dimension: Array) -> Real:
+    def _number(self, start: Array, sample: Array, dimension: Array) -> Real:
         steps = jnp.asarray(sequence_steps(DIMENSIONS))
         step = steps.at[dimension % np.uint32(DIMENSIONS)].get(mode="promise_in_bounds")
+        word = low_discrepancy(start, sample, dimension, step)
         # Far decisions would else share the steps of near ones, and never become independent.
-        sample = jnp.where(dimension < DIMENSIONS, sample, mixed(sample ^ mixed(dimension)))
-        return low_discrepancy(pixel, sample, dimension, step, self.seed, self.dtype)
+        word = jnp.where(dimension < DIMENSIONS, word, mixed(word))
+        # 24 bits fit the significand of float32, so that the number stays below 1.
+        return (word >> 8).astype(self.dtype) * 2.0**-24
 
 
 def uniform_direction(u: Real, v: Real) -> Vec3:
@@ -123,25 +129,14 @@ def circle(turn: Real) -> tuple[Real, Real]:
     )
 
 
-def low_discrepancy(
-    pixel: Array,
-    sample: Array,
-    dimension: Array,
-    step: Array,
-    seed: Array,
-    dtype: str,
-) -> Real:
-    """A number in [0, 1) of a sequence that every pixel and dimension starts elsewhere.
+def low_discrepancy(start: Array, sample: Array, dimension: Array, step: Array) -> Array:
+    """A word of a sequence that every pixel and dimension starts elsewhere.
 
     Args:
-        pixel: number of the pixel in the picture, uint32.
+        start: the pixel's word, uint32.
         sample: number of the sample in the pixel, uint32.
         dimension: which decision of the path it serves, uint32.
         step: the dimension's entry of `sequence_steps`, uint32.
-        seed: of the picture, uint32.
-        dtype: of the number.
     """
-    start = mixed(pixel ^ mixed(dimension ^ mixed(seed)))
-    word = start + sample * step
-    # 24 bits fit the significand of float32, so that the number stays below 1.
-    return (word >> 8).astype(dtype) * 2.0**-24
+    # Multiples of the golden section keep the dimensions of a pixel far apart.
+    return mixed(start + dimension * np.uint32(0x9E3779B9)) + sample * step

@@ -1,4 +1,4 @@
-"""Vectors as three scalars, and roots whose gradients stay finite."""
+"""Vectors as three numbers, and roots whose gradients stay finite."""
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -13,17 +13,21 @@ else:  # what NumPy computes of arrays without axes are numbers of its own
     Array = jax.Array | np.ndarray | np.generic
 """An array of JAX or of NumPy."""
 
-Real = Float[Array, ""]
-"""One real number; `vmap` makes many of it."""
+Real = Float[Array, "..."]
+"""A real number, or one in each of many lanes: `vmap` makes many of one, with all derivatives.
+
+Where none are wanted, what is written for one may as well be given arrays of lanes, which takes
+half as long to trace.
+"""
 
 Triple = Float[Array, "3"]
 """Three numbers as data holds them: a point, a direction or a colour."""
 
 
 class Vec3(NamedTuple):
-    """A vector of three scalars.
+    """A vector of three numbers.
 
-    Under `vmap` this is three long arrays; an array of three would become an (N, 3) array
+    Of many lanes this is three long arrays; an array of three would become an (N, 3) array
     whose inner loop has length 3, which runs many times slower.
     """
 
@@ -44,7 +48,7 @@ class Vec3(NamedTuple):
         return Vec3(-self.x, -self.y, -self.z)
 
     def __mul__(self, scale: Real) -> "Vec3":  # type: ignore[override]
-        """The vector times a scalar."""
+        """The vector times a number."""
         return Vec3(self.x * scale, self.y * scale, self.z * scale)
 
     def dot(self, other: "Vec3") -> Real:
@@ -107,4 +111,4 @@ def safe_sqrt(x: Real, above: Real | float = 0.0) -> Real:
 def normalize(v: Vec3) -> Vec3:
     """The unit vector along `v`; NaN for the zero vector, which has none."""
     squared = v.dot(v)
-    return v * (1.0 / module_of(squared).sqrt(squared))
+    return v * module_of(squared).sqrt(1.0 / squared)

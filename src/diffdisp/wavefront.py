@@ -6,6 +6,7 @@ is done. Each lane then owns a pixel until its other samples are done, and takes
 a queue when enough lanes have nothing left to do.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -135,13 +136,13 @@ class Lane(NamedTuple):
         path: the present path; its radiance is that of all the pixel's paths.
     """
 
-    slot: Int[Array, ""]
-    x: Int[Array, ""]
-    y: Int[Array, ""]
-    waiting: UInt32[Array, ""]
-    sample: Int[Array, ""]
-    wave: Int[Array, ""] | None
-    way: Int[Array, ""] | None
+    slot: Int[Array, " lanes"]
+    x: Int[Array, " lanes"]
+    y: Int[Array, " lanes"]
+    waiting: UInt32[Array, " lanes"]
+    sample: Int[Array, " lanes"]
+    wave: Int[Array, " lanes"] | None
+    way: Int[Array, " lanes"] | None
     path: Path
 
 
@@ -300,9 +301,9 @@ def trace_tiles(
 
 def _sample_ray(plan: Plan, view: View, samples: FilmSamples, x: Array, y: Array, s: Array) -> Ray:
     """The camera ray of sample `s` of the pixel in column `x` and row `y`."""
-    numbers, pixel = _numbers(plan, view), _pixel_number(view, x, y)
+    numbers, start = _numbers(plan, view, x, y)
     word = look_up(samples.number, s)
-    across, down = once(lambda: tuple(numbers.of_film(pixel, word, axis) for axis in (0, 1)), None)
+    across, down = once(lambda: tuple(numbers.of_film(start, word, axis) for axis in (0, 1)), None)
     return camera_ray(
         view.projection,
         x.astype(plan.dtype) + (look_up(samples.right, s) + across * samples.cell[0]),
@@ -310,12 +311,11 @@ def _sample_ray(plan: Plan, view: View, samples: FilmSamples, x: Array, y: Array
     )
 
 
-def _numbers(plan: Plan, view: View) -> Numbers:
-    return Numbers(plan.numbers_per_bounce, view.seed, plan.dtype)
-
-
-def _pixel_number(view: View, x: Array, y: Array) -> Array:
-    return (y * view.width + x).astype(jnp.uint32)
+def _numbers(plan: Plan, view: View, x: Array, y: Array) -> tuple[Numbers, Array]:
+    """The numbers of a picture, and the word from which those of a pixel start."""
+    numbers = Numbers(plan.numbers_per_bounce, view.seed, plan.dtype)
+    pixel = (y * view.width + x).astype(jnp.uint32)
+    return numbers, once(lambda: numbers.start(pixel))
 
 
 def _first_hits(
@@ -325,10 +325,10 @@ def _first_hits(
 
     Returns:
         For each pixel the sum of what its samples see that end at once, a list of channels; a bit
-        for each sample that goes on; for (pixel, sample) in one axis the surface it meets; and
-        the pixels with samples that go on.
+        for each sample that goes on; for (tile, sample, pixel) the surface it meets; and the
+        pixels with samples that go on.
     """
-    size, capacity = edge * edge, tiles.x.shape[0]
+    size, capacity, shares = edge * edge, tiles.x.shape[0], _shares(plan)
     pixels = capacity * size
     y, x = np.divmod(np.arange(size, dtype=np.int32), np.int32(edge))
     world, tables = view.world, Tables(view.world, view.paint)
@@ -337,7 +337,7 @@ def _first_hits(
     radii = jnp.append(world.radii, 0.0)
     numbers = jnp.asarray(np.append(surface_numbers(plan)[0], np.int32(0)))
 
-    def see(tile: Array) -> tuple[tuple[Array, ...], Array, Array, Array]:
+    def see(tile: Array) -> tuple[tuple[Any, Array, Array], Array]:
         rows = tiles.candidates[tile]
         spheres = Candidates(
             Vec3(*(axis[rows] for axis in centers)),
@@ -348,46 +348,41 @@ def _first_hits(
             True,
             None,
         )
-
-        def one_sample(x: Array, y: Array, s: Array) -> tuple[tuple[Real, ...], Array]:
-            ray = once(lambda: _sample_ray(plan, view, samples, x, y, s))
-            surface = nearest(ray, world, plan, no_surface(ray.origin.x), spheres)
-            path = new_path(ray, None, surface, plan)
-            shown = emitted(surface, path, tables, plan, None)
-            ends = surface >= plan.first_lamp
-            shown = tuple(jnp.where(ends, channel, 0.0) for channel in shown)
-            return shown, jnp.where(path.alive, surface, -1)
-
-        of_pixel = jax.vmap(one_sample, (None, None, 0))
-        column, row = tiles.x[tile] + x, tiles.y[tile] + y
-        shown, surface = jax.vmap(of_pixel, (0, 0, None))(
-            column, row, np.arange(plan.samples, dtype=np.int32)
-        )
+        # Arrays (samples, pixels): what is summed over samples is alike along a row.
+        column, row = (tiles.x[tile] + x)[None], (tiles.y[tile] + y)[None]
+        sample = np.arange(plan.samples, dtype=np.int32)[:, None]
+        ray = once(lambda: _sample_ray(plan, view, samples, column, row, sample))
+        surface = nearest(ray, world, plan, no_surface(ray.direction.x), spheres)
+        path = new_path(ray, None, surface, plan)
+        ends = surface >= plan.first_lamp
+        light = emitted(surface, path, tables, plan, None)
+        shown = tuple(jnp.sum(jnp.where(ends, channel, 0.0), axis=0) for channel in light)
         inside = (column < view.width) & (row < view.height)
-        bits = np.uint32(1) << np.arange(plan.samples, dtype=np.uint32)
-        goes_on = (surface >= 0) & inside[:, None]
-        waiting = jnp.sum(jnp.where(goes_on, bits, np.uint32(0)), axis=-1, dtype=jnp.uint32)
-        shiny = jnp.any(goes_on & (surface < plan.mattes[0]), axis=-1)
-        seen = tuple(jnp.sum(channel, axis=-1) for channel in shown)
-        return seen, waiting, surface.reshape(-1), shiny
+        bits = np.uint32(1) << np.arange(plan.samples, dtype=np.uint32)[:, None]
+        goes_on = path.alive & inside
+        waiting = jnp.sum(jnp.where(goes_on, bits, np.uint32(0)), axis=0, dtype=jnp.uint32)
+        shiny = jnp.any(goes_on & (surface < plan.mattes[0]), axis=0)
+        return (shown, waiting, surface.reshape(-1)), shiny
 
     def put(tile: Array, state: Any) -> Any:
         def at(whole: Array, part: Array) -> Array:
             return jax.lax.dynamic_update_slice(whole, part, (tile * part.shape[0],))
 
         results, queue = state
-        *found, shiny = see(tile)
+        found, shiny = see(tile)
         waiting, slots, lengths = found[1], list(queue.slots), list(queue.lengths)
-        for share, mask in enumerate(_shares(plan)):
-            row = int(share == 0)
-            chosen = ((waiting & mask) != 0) & (shiny if share else ~shiny)
+        for row, masks in enumerate((shares[1:], shares[:1])):
+            if not len(masks):
+                continue
+            chosen = ((waiting[None] & masks[:, None]) != 0) & (~shiny if row else shiny)[None]
+            place = first_places(chosen.reshape(-1))
             # All of a tile's pixels are written; the next ones take the places of those that do
             # not wait.
-            part = first_places(chosen) + (share * pixels + tile * size)
-            slots[row] = jax.lax.dynamic_update_slice(slots[row], part, (lengths[row],))
+            slot = (place // size + (1 - row)) * pixels + (tile * size + place % size)
+            slots[row] = jax.lax.dynamic_update_slice(slots[row], slot, (lengths[row],))
             lengths[row] = lengths[row] + jnp.sum(chosen, dtype=jnp.int32)
         queue = Queue(tuple(slots), tuple(lengths))
-        return jax.tree.map(at, results, tuple(found)), queue
+        return jax.tree.map(at, results, found), queue
 
     empty = (
         tuple(jnp.zeros(capacity * size, plan.dtype) for _ in range(plan.channels)),
@@ -395,10 +390,10 @@ def _first_hits(
         jnp.zeros(capacity * size * plan.samples, jnp.int32),
     )
     none = jnp.zeros((), jnp.int32)
-    rows = (len(_shares(plan)) - 1) * pixels + size, pixels + size
+    rows = (len(shares) - 1) * pixels + len(shares) * size, pixels + size
     nobody = Queue(tuple(jnp.zeros(row, jnp.int32) for row in rows), (none, none))
     (shown, waiting, hits), queue = jax.lax.fori_loop(0, tiles.filled, put, (empty, nobody))
-    return list(shown), waiting, hits, queue
+    return list(shown), waiting, hits.reshape(capacity, plan.samples, size), queue
 
 
 def _shares(plan: Plan) -> np.ndarray:
@@ -417,14 +412,14 @@ def _follow(
     samples: FilmSamples,
     tiles: Tiles,
     waiting: UInt32[Array, " pixels"],
-    hits: Int[Array, " pixel_samples"],
+    hits: Int[Array, "tiles samples size"],
     queue: Queue,
 ) -> tuple[Array, ...]:
     """The sum of each pixel's samples that went on, a channel each, with a place to spare."""
     pixels, waves, length = waiting.shape[0], samples.indices.shape[1], queue.length
     shares = _shares(plan)
     sink = len(shares) * pixels
-    advance = jax.vmap(lambda lane: _advance(lane, plan, view, samples, hits))
+    advance = partial(_advance, plan=plan, view=view, samples=samples, hits=hits)
 
     def busy(lane: Lane) -> Array:
         return lane.path.alive | (lane.waiting != 0) | _splits(lane, waves)
@@ -432,7 +427,12 @@ def _follow(
     def collect(lane: Lane, results: tuple[Array, ...]) -> tuple[Array, ...]:
         slot = jnp.where(busy(lane), sink, lane.slot)
         pairs = zip(results, lane.path.radiance, strict=True)
-        return tuple(jnp.asarray(whole).at[slot].set(value) for whole, value in pairs)
+        return tuple(
+            jnp.asarray(whole)
+            .at[slot]
+            .set(value, mode="promise_in_bounds", wrap_negative_indices=False)
+            for whole, value in pairs
+        )
 
     def refill(lane: Lane, taken: Array) -> tuple[Lane, Array]:
         idle = ~busy(lane)
@@ -443,9 +443,9 @@ def _follow(
         tile, pixel = number // (edge * edge), number % (edge * edge)
         renewed = lane._replace(
             slot=slot,
-            x=tiles.x[tile] + pixel % edge,
-            y=tiles.y[tile] + pixel // edge,
-            waiting=waiting[number] & look_up(shares, share),
+            x=look_up(tiles.x, tile) + pixel % edge,
+            y=look_up(tiles.y, tile) + pixel // edge,
+            waiting=look_up(waiting, number) & look_up(shares, share),
             path=lane.path._replace(radiance=tuple(jnp.zeros_like(r) for r in lane.path.radiance)),
         )
         # What idles for good writes its result once more, to a place that nobody reads.
@@ -455,23 +455,21 @@ def _follow(
 
     def turn(state: Any) -> Any:
         lane, results, taken = state
-        results = collect(lane, results)
         lane, taken = refill(lane, taken)
         least = jnp.where(taken < length, int(lanes * (1 - IDLE)), 0)
         lane = jax.lax.while_loop(
             lambda lane: jnp.sum(busy(lane), dtype=jnp.int32) > least, advance, lane
         )
-        return lane, results, taken
+        return lane, collect(lane, results), taken
 
     def unfinished(state: Any) -> Array:
         return (state[2] < length) | jnp.any(busy(state[0]))
 
     results = tuple(jnp.zeros(sink + 1, plan.dtype) for _ in range(plan.channels))
     none = jnp.zeros((), jnp.int32)
-    lane, results, _ = jax.lax.while_loop(
+    return jax.lax.while_loop(
         unfinished, turn, (_idle_lanes(plan, lanes, sink, view), results, none)
-    )
-    return collect(lane, results)
+    )[1]
 
 
 def _idle_lanes(plan: Plan, lanes: int, sink: int, view: View) -> Lane:
@@ -495,7 +493,7 @@ def _idle_lanes(plan: Plan, lanes: int, sink: int, view: View) -> Lane:
 def _advance(lane: Lane, plan: Plan, view: View, samples: FilmSamples, hits: Array) -> Lane:
     """The lane's path advanced by one surface; where it has ended, that of its next sample."""
     lane = once(lambda: _next_sample(lane, plan, view, samples, hits))
-    numbers, pixel = _numbers(plan, view), _pixel_number(view, lane.x, lane.y)
+    numbers, start = _numbers(plan, view, lane.x, lane.y)
     word = look_up(samples.number, lane.sample)
     place: Array | int = 0
     weights = always = split = None
@@ -516,7 +514,7 @@ def _advance(lane: Lane, plan: Plan, view: View, samples: FilmSamples, hits: Arr
     setting = Setting(
         Tables(view.world, view.paint),
         plan,
-        lambda bounces, decision: numbers.of_bounce(pixel, word, bounces, decision),
+        lambda bounces, decision: numbers.of_bounce(start, word, bounces, decision),
         lambda ball: look_up(samples.indices.reshape(-1), place * plan.balls + ball),
         weights,
         always,
@@ -553,8 +551,10 @@ def _next_sample(lane: Lane, plan: Plan, view: View, samples: FilmSamples, hits:
     lowest, again, sample = once(following)
     starts = ~lane.path.alive & (again | (lane.waiting != 0))
     ray = _sample_ray(plan, view, samples, lane.x, lane.y, sample)
-    pixels = hits.shape[0] // plan.samples
-    surface = look_up(hits, jax.lax.rem(lane.slot, np.int32(pixels)) * plan.samples + sample)
+    tiles, _, size = hits.shape
+    number = lane.slot % (tiles * size)
+    place = (number // size * plan.samples + sample) * size + number % size
+    surface = look_up(hits.reshape(-1), place)
     path = new_path(ray, None, surface, plan)._replace(radiance=lane.path.radiance)
     new = lane._replace(
         waiting=jnp.where(again, lane.waiting, lane.waiting & ~lowest), sample=sample, path=path
@@ -574,7 +574,7 @@ def _next_sample(lane: Lane, plan: Plan, view: View, samples: FilmSamples, hits:
     return choose(starts, new, lane)
 
 
-def _bit_number(bit: UInt32[Array, ""]) -> Int[Array, ""]:
+def _bit_number(bit: UInt32[Array, " lanes"]) -> Int[Array, " lanes"]:
     """Which bit of a word is set, 0 if none is: the exponent of the word as a number.
 
     To count the bits below it takes ten times as long where a processor counts word by word.
