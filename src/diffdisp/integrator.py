@@ -165,11 +165,18 @@ def _table(vectors: list[Vec3]) -> Vec3:
     return Vec3(*(_row([v[axis] for v in vectors]) for axis in range(3)))
 
 
+FEW = 4
+"""Rows of a table among which to choose takes less time than to look up one."""
+
+
 def _pick(table: Array, index: Array | int) -> Array:
-    """A row of a table that has it; of a table of one row, that row, without a look-up."""
-    if table.shape[0] == 1:
-        return table[0]
-    return look_up(table, index)
+    """A row of a table that has it; of a table of one row, that row."""
+    if isinstance(index, int) or table.shape[0] > FEW:
+        return look_up(table, index)
+    row = jnp.asarray(table[0])
+    for number in range(1, table.shape[0]):
+        row = jnp.where(index == number, table[number], row)
+    return row
 
 
 def look_up(table: Array, *place: Array | int) -> Array:
@@ -188,7 +195,7 @@ class Candidates(NamedTuple):
     Args:
         centers: of the spheres; a row to spare has no size.
         radii: of the spheres.
-        numbers: of the surfaces.
+        numbers: of the surfaces; None where rows are those of the scene's table.
         groups: how many groups of `group` rows count.
         group: rows of a group, which are taken together.
         several: whether there may be more groups than one.
@@ -197,7 +204,7 @@ class Candidates(NamedTuple):
 
     centers: Vec3
     radii: Float[Array, " rows"]
-    numbers: Int[Array, " rows"]
+    numbers: Int[Array, " rows"] | None
     groups: Int[Array, ""] | int
     group: int
     several: bool
@@ -220,7 +227,7 @@ def all_spheres(world: World, plan: Plan, one: Array | None) -> Candidates:
     return Candidates(
         Vec3(*map(filled, world.centers)),
         filled(world.radii),
-        filled(surface_numbers(plan)[0]),
+        None,
         groups,
         group,
         groups > 1,
@@ -254,6 +261,12 @@ def nearest(
     word = jnp.int64 if plan.dtype == "float64" else jnp.int32
     rows = np.asarray((1 << max(spheres.group - 1, 0).bit_length()) - 1, word)
 
+    def number_at(place: Array | int) -> Array:
+        if spheres.numbers is not None:
+            return _pick(spheres.numbers, place)
+        lamps_on = plan.first_lamp - plan.first_plane
+        return jnp.where(place < plan.first_plane, place, place + lamps_on)
+
     def of_group(group: Array | int) -> Array:
         """The nearest of a group: its distance, with its row in the last bits.
 
@@ -264,7 +277,7 @@ def nearest(
         words = []
         for row in range(spheres.group):
             place = group * spheres.group + row
-            center, number = _pick_vector(centers, place), spheres.numbers[place]
+            center, number = _pick_vector(centers, place), number_at(place)
             distance, meets = first_distance(ray, center, squares[place], number == last)
             if footprint is not None and plan.soft:
                 radius = radii[place]
@@ -298,7 +311,7 @@ def nearest(
     number: Array = jnp.full_like(last, plan.background)
     if spheres.group:
         place = group * spheres.group + (best & rows).astype(jnp.int32)
-        number = jnp.where(distance < jnp.inf, _pick(spheres.numbers, place), number)
+        number = jnp.where(distance < jnp.inf, number_at(place), number)
     for row, plane in enumerate(surface_numbers(plan)[1]):
         point, normal = vec3_row(world.points, row), vec3_row(world.normals, row)
         to_plane = plane_distance(ray, point, normal)
@@ -1254,14 +1267,8 @@ def _aim(
         u = jnp.where(taken, u, u - share) / jnp.where(rest > 0, rest, 1.0)
         return (total, jnp.where(taken, row, number), u), None
 
-    lamps = slice(plan.first_plane, plan.spheres)
-    centers = Vec3(*(axis[lamps] for axis in world.centers))
-    rows = (
-        centers,
-        world.radii[lamps],
-        _luminances(paint, plan),
-        np.arange(plan.lamps, dtype=np.int32),
-    )
+    centers, radii = _lamps(world, plan)
+    rows = centers, radii, _luminances(paint, plan), np.arange(plan.lamps, dtype=np.int32)
 
     def choice() -> tuple[Real, Array]:
         """The sum of all lamps' weights, and the number of one of them."""
@@ -1294,6 +1301,12 @@ def _aim(
         lamp_share=share,
         lamp_total=total,
     )
+
+
+def _lamps(world: World, plan: Plan) -> tuple[Vec3, Float[Array, " lamps"]]:
+    """Centres and radii of the lamps."""
+    lamps = slice(plan.first_plane, plan.spheres)
+    return Vec3(*(axis[lamps] for axis in world.centers)), world.radii[lamps]
 
 
 def _luminances(paint: Paint, plan: Plan) -> Float[Array, " lamps"]:
@@ -1350,9 +1363,8 @@ def _chance_weight(surface: Array, scattered: Scattered, tables: Tables, plan: P
     assert scattered.density is not None
     assert scattered.lamp_total is not None
     lamp = jnp.clip(surface - first, 0, plan.lamps - 1)
-    row = lamp + plan.first_plane
-    offset = _pick_vector(world.centers, row) - scattered.ray.origin
-    radius = _pick(world.radii, row)
+    centers, radii = _lamps(world, plan)
+    offset, radius = _pick_vector(centers, lamp) - scattered.ray.origin, _pick(radii, lamp)
     outside = offset.dot(offset) > radius * radius * (1.0 + 1e-4)
     weighed = scattered.matte & outside & (surface >= first) & (surface < first + plan.lamps)
     total = jnp.where(scattered.lamp_total > 0, scattered.lamp_total, 1.0)
