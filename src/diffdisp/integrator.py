@@ -800,7 +800,8 @@ class Setting(NamedTuple):
         split: how paths part at the first surface; None where they never do.
         cutoff: part of its light with which a path ends.
         one: as in `once`.
-        differentiable: whether the chance of a choice, which is detached, is made up for.
+        differentiable: whether derivatives may be asked for: then the chance of a choice, which is
+            detached, is made up for, and ended paths keep finite numbers.
     """
 
     tables: Tables
@@ -952,14 +953,20 @@ def _parting(path: Path, setting: Setting, inside: Array | bool) -> tuple[Way, W
 def _go_on(
     path: Path, moved: Path, goes_on: Array, differ: Array, radiance: Channels, setting: Setting
 ) -> Path:
-    """The moved path if it goes on; else the old one, ended, with finite numbers."""
+    """The moved path, ended unless it goes on.
+
+    Where derivatives may be asked for an ended path is the old one, whose numbers are finite. Else
+    nobody reads them: only tables are looked up with them, within their bounds.
+    """
     bounces = path.bounces + jnp.where(differ, 1, 0)
     # Colours have negative parts where a wavelength is outside what a screen can show.
     brightest = reduce(jnp.maximum, map(jnp.abs, moved.throughput))
     # A path of b bounces has b + 1 segments, and the light that it adds next came over one more.
     alive = path.alive & goes_on & (brightest > setting.cutoff)
     alive = alive & (bounces < setting.plan.depth - 1)
-    kept = choose(alive, moved._replace(bounces=bounces), path)
+    kept = moved._replace(bounces=bounces)
+    if setting.differentiable:
+        kept = choose(alive, kept, path)
     return kept._replace(
         radiance=radiance, alive=alive, spectral=moved.spectral, reflected=moved.reflected
     )

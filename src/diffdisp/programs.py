@@ -65,14 +65,17 @@ def program(traced: Callable[..., jax.Array], static: tuple[Any, ...], arguments
     """
     leaves, structure = jax.tree.flatten((arguments, {}))
     shapes = tuple((leaf.shape, leaf.dtype.name) for leaf in leaves)
-    config: Any = jax.config
-    wide = bool(config.jax_enable_x64)
+    wide = bool(_config().jax_enable_x64)
     key = (traced, static, structure, shapes, wide)
     with _LOCK:
         if key not in _READY:
             described = repr((traced.__name__, static, str(structure), shapes, wide))
             _READY[key] = _loaded_or_compiled(traced, static, arguments, described)
         return _READY[key]
+
+
+def _config() -> Any:
+    return jax.config
 
 
 def _loaded_or_compiled(
@@ -88,13 +91,14 @@ def _loaded_or_compiled(
         except Exception:  # whatever is wrong with a kept program, there is another way to it
             file.unlink(missing_ok=True)
     # JAX must not find it in its own cache: what comes from there cannot be kept once more. So
-    # each compilation has a name that no other has.
+    # each compilation has a name that no other has, and is not put there.
     alone = functools.update_wrapper(functools.partial(traced), traced)
     alone.__name__ = f"{traced.__name__}_{secrets.token_hex(8)}"
     jitted = jax.jit(alone, static_argnums=tuple(range(len(static))), compiler_options=QUICK)
     with _no_collection():
         lowered = jitted.lower(*static, *arguments)
-    compiled = lowered.compile()
+    with _not_in_jax_cache():
+        compiled = lowered.compile()
     if file is not None:
         _keep(compiled, file)
     return compiled
@@ -112,6 +116,18 @@ def _no_collection() -> Iterator[None]:
             gc.enable()
 
 
+@contextmanager
+def _not_in_jax_cache() -> Iterator[None]:
+    """Nothing is written to JAX's own cache, which takes as long as to keep the program here."""
+    name = "jax_persistent_cache_min_compile_time_secs"
+    least = getattr(_config(), name)
+    jax.config.update(name, float("inf"))
+    try:
+        yield
+    finally:
+        jax.config.update(name, least)
+
+
 def _keep(compiled: Any, file: Path) -> None:
     """Write a compiled program; a folder that cannot be written costs only the next start."""
     try:
@@ -125,7 +141,7 @@ def _keep(compiled: Any, file: Path) -> None:
 
 def _file(described: str) -> Path | None:
     """Where a program is kept; None where JAX keeps none."""
-    config: Any = jax.config
+    config = _config()
     folder = config.jax_compilation_cache_dir
     if not folder or not config.jax_enable_compilation_cache:
         return None
