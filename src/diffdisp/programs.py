@@ -121,11 +121,11 @@ def _not_in_jax_cache() -> Iterator[None]:
     """Nothing is written to JAX's own cache, which takes as long as to keep the program here."""
     name = "jax_persistent_cache_min_compile_time_secs"
     least = getattr(_config(), name)
-    jax.config.update(name, float("inf"))
+    _config().update(name, float("inf"))
     try:
         yield
     finally:
-        jax.config.update(name, least)
+        _config().update(name, least)
 
 
 def _keep(compiled: Any, file: Path) -> None:

@@ -18,6 +18,7 @@ from diffdisp.camera import Camera, Projection, camera_ray
 from diffdisp.film import Film
 from diffdisp.geometry import Ray, Sphere
 from diffdisp.integrator import (
+    MOST_TOGETHER,
     Candidates,
     Paint,
     Path,
@@ -25,6 +26,7 @@ from diffdisp.integrator import (
     Split,
     Tables,
     World,
+    all_spheres,
     bounce,
     emitted,
     first_places,
@@ -332,22 +334,27 @@ def _first_hits(
     pixels = capacity * size
     y, x = np.divmod(np.arange(size, dtype=np.int32), np.int32(edge))
     world, tables = view.world, Tables(view.world, view.paint)
-    # A sphere of no size for the rows that only fill the groups.
-    centers = Vec3(*(jnp.append(axis, 0.0) for axis in world.centers))
-    radii = jnp.append(world.radii, 0.0)
-    numbers = jnp.asarray(np.append(surface_numbers(plan)[0], np.int32(0)))
+    # So few take less time than to look up which of them a tile can see.
+    every = all_spheres(world, plan, None) if plan.spheres <= MOST_TOGETHER else None
 
-    def see(tile: Array) -> tuple[tuple[Any, Array, Array], Array]:
+    def candidates(tile: Array) -> Candidates:
         rows = tiles.candidates[tile]
-        spheres = Candidates(
+        # A sphere of no size for the rows that only fill the groups.
+        centers = Vec3(*(jnp.append(axis, 0.0) for axis in world.centers))
+        radii = jnp.append(world.radii, 0.0)
+        numbers = jnp.asarray(np.append(surface_numbers(plan)[0], np.int32(0)))
+        return Candidates(
             Vec3(*(axis[rows] for axis in centers)),
             radii[rows],
             numbers[rows],
             tiles.groups[tile],
-            GROUP if plan.spheres else 0,
+            GROUP,
             True,
             None,
         )
+
+    def see(tile: Array) -> tuple[tuple[Any, Array, Array], Array]:
+        spheres = every or candidates(tile)
         # Arrays (samples, pixels): what is summed over samples is alike along a row.
         column, row = (tiles.x[tile] + x)[None], (tiles.y[tile] + y)[None]
         sample = np.arange(plan.samples, dtype=np.int32)[:, None]
