@@ -8,7 +8,8 @@ over an edge are few, so they are noisy; but two pictures A and B of different p
 independent errors, and the mean of (S - A)(S - B) has none of either's noise in it.
 
 Of the outline of a lamp that is seen through the ball, the measure is central differences of
-renders of so many samples that a step crosses several of each pixel on the outline.
+renders of so many samples that a step crosses several of each pixel on the outline. Where paths
+scatter, it is those of the wavefront loop, whose edges are hard.
 """
 
 import argparse
@@ -25,10 +26,14 @@ from record import ROOT, print_table, write_record
 from diffdisp import (
     Background,
     Camera,
+    Checker,
+    Checker2D,
     Dielectric,
     Emitter,
     Film,
+    Lambertian,
     Object,
+    Plane,
     Scene,
     Sellmeier,
     Sphere,
@@ -50,6 +55,8 @@ MOST_ORDERS = 2000
 """For rays so close to grazing that they hardly lose light: fewer than one in a million."""
 OUTLINE_SAMPLES, OUTLINE_STEP = (1600, 2116), 2e-3
 """Of the pictures whose differences tell how a lamp's outline moves, and the step in n."""
+SCATTERED_SIZE, SCATTERED_SAMPLES, SCATTERED_STEP = 48, 4096, 2e-3
+"""Of the pictures whose differences tell how the edges of a matte ground move, and the step."""
 PLASTIC = 1.32471795724474602596
 """Root of x³ = x + 1, for evenly spread points. Source: Roberts, The unreasonable effectiveness
 of quasirandom sequences (2018)."""
@@ -177,16 +184,17 @@ def noise(pair: np.ndarray) -> float:
 # The derivative of the render.
 
 
-def index_picture(scene: Scene, size: int, samples: int) -> Callable[[jax.Array], jax.Array]:
+def index_picture(
+    scene: Scene, size: int, samples: int, seed: int = 0
+) -> Callable[[Any], jax.Array | np.ndarray]:
     """The picture (size, size) of one band, in float64, as a function of the index."""
     film = Film(size, size, np.array([WAVELENGTH]))
 
-    def picture(n: jax.Array) -> jax.Array:
+    def picture(n: Any) -> jax.Array | np.ndarray:
         B = jnp.zeros(3).at[0].set(n * n - 1)  # with C = 0 a glass of index n everywhere
         glass = Sellmeier(B, jnp.zeros(3))
-        return render(with_glass(scene, BALL, glass), film, samples=samples, dtype="float64")[
-            ..., 0
-        ]
+        seen = with_glass(scene, BALL, glass)
+        return render(seen, film, samples=samples, seed=seed, dtype="float64")[..., 0]
 
     return picture
 
@@ -268,6 +276,49 @@ def outline(options: argparse.Namespace) -> list[dict[str, Any]]:
     return rows
 
 
+def scattered(samples: list[int]) -> list[dict[str, Any]]:
+    """The derivative of a ball over a matte chequered ground, against hard-edged differences."""
+    ball = Object(Sphere([0.0, 0, 0], 1.0), Dielectric("N-BK7"), "ball")
+    globe = Object(
+        Sphere([0.0, -101, 0], 100.0), Lambertian(Checker([0.1] * 3, [0.9] * 3, 6.0)), "ground"
+    )
+    flat = Object(
+        Plane([0.0, -1, 0], [0.0, 1, 0]), Lambertian(Checker2D([0.9] * 3, [0.1] * 3, 0.6)), "ground"
+    )
+    level = Camera([0.0, 0.6, 3.2], [0.0, -0.1, 0], vertical_fov=42.0)
+    above = Camera([0.0, 5.0, 2.0], [0.0, -0.4, 0], vertical_fov=27.0)
+    views = {
+        "ground of radius 100": (level, globe),
+        "plane": (level, flat),
+        "plane from above": (above, flat),
+    }
+    n = float(named_glass("N-BK7").refractive_index(np.asarray(WAVELENGTH)))
+    rows = []
+    for name, (camera, ground) in views.items():
+        scene, pair = Scene(camera, [ball, ground], Background([1.0, 1, 1])), []
+        for seed in (1, 2):
+            picture = index_picture(scene, SCATTERED_SIZE, SCATTERED_SAMPLES, seed)
+            more, less = (np.asarray(picture(n + h)) for h in (SCATTERED_STEP, -SCATTERED_STEP))
+            pair.append((more - less) / (2 * SCATTERED_STEP))
+        for count in samples:
+            picture = index_picture(scene, SCATTERED_SIZE, count)
+            both = jax.jit(lambda n, of=picture: jax.jvp(of, (n,), (jnp.ones_like(n),))[1])
+            start, slope = time.perf_counter(), np.asarray(both(jnp.asarray(n)))
+            first = time.perf_counter() - start
+            warm = timed(both, jnp.asarray(n))[0]
+            rows.append(
+                {
+                    "scene": name,
+                    "samples": count,
+                    "from_hard_edges": apart(slope, np.stack(pair)),
+                    "noise": noise(np.stack(pair)),
+                    "warm_s": warm,
+                    "first_s": first,
+                }
+            )
+    return rows
+
+
 # What it costs.
 
 
@@ -323,6 +374,7 @@ def main() -> None:
     parser.add_argument("--grids", type=int, nargs="+", default=[32, 48], help="√points of a pixel")
     parser.add_argument("--steps", type=float, nargs="+", default=[1e-3, 5e-4], help="in n, hard")
     parser.add_argument("--h", type=float, default=1e-6, help="step in n of the render")
+    parser.add_argument("--scattered", type=int, nargs="+", default=[256, 1024], help="samples")
     parser.add_argument("--runs", type=int, default=7, help="warm ones, for the median")
     options = parser.parse_args()
     scene = load_scene(str(BENCH))
@@ -333,6 +385,7 @@ def main() -> None:
     with jax.enable_x64(True):
         figures |= accuracy(scene, options)
         figures["outline"] = outline(options)
+        figures["scattered"] = scattered(options.scattered)
     for dtype in ("float32", "float64"):
         head = (dtype, "wall s", "CPU s", "wall ratio", "CPU ratio", "first s")
         print_table(head, [list(row.values()) for row in figures[f"cost_{dtype}"]])
@@ -345,6 +398,16 @@ def main() -> None:
     print()
     head = ("samples", "outline: to hard edges", "noise of those")
     print_table(head, [list(row.values()) for row in figures["outline"]])
+    print()
+    head = (
+        "where paths scatter",
+        "samples",
+        "to hard edges",
+        "noise of those",
+        "warm s",
+        "first s",
+    )
+    print_table(head, [list(row.values()) for row in figures["scattered"]])
     write_record("derivative", vars(options), figures)
 
 

@@ -76,16 +76,32 @@ def run_numbers(
     """
     least = 4.0 * float(np.finfo(plan.dtype).eps) if cutoff is None else cutoff
     taken = np.arange(plan.samples) if cells is None else cells[0]
-    columns, rows = sample_grid(plan.samples if cells is None else cells.size)
+    count = plan.samples if cells is None else cells.size
+    if plan.filtered:
+        count = footprints(count)
+    columns, rows = sample_grid(count)
+    place = taken * count // (plan.samples if cells is None else cells.size)
     return RunNumbers(
         np.asarray(seed % 2**32, np.uint32),
         np.asarray(least),
         np.asarray(1, np.int32),
         taken.astype(np.uint32),
-        (taken % columns) / columns,
-        (taken // columns) / rows,
+        (place % columns) / columns,
+        (place // columns) / rows,
         (np.asarray(1.0 / columns), np.asarray(1.0 / rows)),
     )
+
+
+def footprints(samples: int) -> int:
+    """Into how many parts a pixel is divided for its samples, some of which share each of them.
+
+    What a path sees is averaged over its part until it scatters, and drawn at random after that:
+    small parts would leave few samples to tell what is lit at an edge, and large ones are not as
+    straight. So both become better with more samples.
+    """
+    most = max(16, round(2 * samples**0.5))
+    count = max(k for k in range(1, most + 1) if samples % k == 0)
+    return count if 4 * count >= min(most, samples) else samples
 
 
 def film_size(film: Film) -> tuple[np.ndarray, np.ndarray]:
@@ -348,7 +364,7 @@ def chunk_lanes(
     def place(edges: Array, axis: int) -> Array:
         """From the left or upper edge of each pixel to its samples (S, P), pixels."""
         within: Array | float = 0.5
-        if plan.scattering:  # what is not averaged over the cell is seen at a point of it
+        if plan.scattering and not plan.filtered:  # what is not averaged is seen at one point
             numbers = Numbers(plan.numbers_per_bounce, run.seed, plan.dtype)
             by_pixel = jax.vmap(numbers.of_film, (0, None, None))
             within = jax.vmap(by_pixel, (None, 0, None))(

@@ -242,6 +242,7 @@ def nearest(
     last: Array,
     spheres: Candidates,
     footprint: tuple[Ray, Ray] | None = None,
+    without: Array | None = None,
 ) -> Array:
     """Number of the surface that a ray meets first.
 
@@ -252,7 +253,8 @@ def nearest(
         last: number of the surface on which the ray starts, -1 for none. Its own distance of
             zero is divided out, so that no offset is needed to leave it.
         spheres: those that the ray can meet.
-        footprint: of the ray; where balls are soft, a part of it that meets one counts as all.
+        footprint: of the ray; where outlines are soft, a part of it that meets one counts as all.
+        without: number of a surface that is left out.
     """
     ray, world, centers, radii, footprint = jax.lax.stop_gradient(
         (ray, world, spheres.centers, spheres.radii, footprint)
@@ -260,6 +262,8 @@ def nearest(
     squares = radii * radii
     word = jnp.int64 if plan.dtype == "float64" else jnp.int32
     rows = np.asarray((1 << max(spheres.group - 1, 0).bit_length()) - 1, word)
+
+    reach = footprint if plan.soft or plan.filtered else None
 
     def number_at(place: Array | int) -> Array:
         if spheres.numbers is not None:
@@ -279,12 +283,13 @@ def nearest(
             place = group * spheres.group + row
             center, number = _pick_vector(centers, place), number_at(place)
             distance, meets = first_distance(ray, center, squares[place], number == last)
-            if footprint is not None and plan.soft:
-                radius = radii[place]
-                along, depth, edges = sphere_depth(ray, footprint, center, radius)
+            if reach is not None:
+                along, depth, edges = sphere_depth(ray, reach, center, radii[place])
                 grazes = (depth <= 0) & (depth + 0.5 * box_width(edges) > 0) & (along > 0)
-                grazes = grazes & (number < plan.balls) & (number != last)
+                grazes = grazes & ((number < plan.balls) == plan.soft) & (number != last)
                 distance, meets = jnp.where(grazes, along, distance), meets | grazes
+            if without is not None:
+                meets = meets & (number != without)
             far = jnp.where(meets, distance, jnp.inf)
             words.append((jax.lax.bitcast_convert_type(far, word) & ~rows) | np.asarray(row, word))
         return reduce(jnp.minimum, words)
@@ -315,7 +320,13 @@ def nearest(
     for row, plane in enumerate(surface_numbers(plan)[1]):
         point, normal = vec3_row(world.points, row), vec3_row(world.normals, row)
         to_plane = plane_distance(ray, point, normal)
+        if reach is not None and plan.filtered:
+            across, down = (edge.direction.dot(normal) for edge in reach)
+            grazes = jnp.abs(ray.direction.dot(normal)) < 0.5 * box_width((across, down))
+            to_plane = jnp.where(grazes, jnp.abs(to_plane), to_plane)
         closer = (to_plane > 0) & (last != plane) & (to_plane < distance)
+        if without is not None:
+            closer = closer & (plane != without)
         distance = jnp.where(closer, to_plane, distance)
         number = jnp.where(closer, plane, number)
     return number
@@ -661,7 +672,7 @@ def start_path(
         return camera_ray(projection, x, y)
 
     zero = jnp.zeros_like(film_point[0])
-    if plan.scattering:
+    if plan.scattering and not plan.filtered:
         ray, footprint = through(*film_point), None
     else:
         ray, push = jax.linearize(through, *film_point)
@@ -995,6 +1006,8 @@ class Scattered(NamedTuple):
         matte: whether the surface is matte.
         spectral: whether dispersive glass has been met.
         reflected: as in `Path`.
+        share: of the light at glass that goes the chosen way, over the chance of that; None where
+            no derivatives are asked for, or no glass is there.
         density: of the chosen direction, in solid angle, where matte; None, as the others, where
             no lamps are aimed at.
         lamp: number of the lamp that the ray `to_lamp` aims at.
@@ -1010,6 +1023,7 @@ class Scattered(NamedTuple):
     matte: Array
     spectral: Array | None
     reflected: Real | None
+    share: Real | None
     density: Real | None = None
     lamp: Array | None = None
     to_lamp: Ray | None = None
@@ -1020,9 +1034,12 @@ class Scattered(NamedTuple):
 def _one_way(path: Path, setting: Setting) -> Path:
     """A bounce in a scene with matte or metal surfaces: one way, chosen at once."""
     plan, tables = setting.plan, setting.tables
-    scattered = _scatter(path, setting)
+    scattered, footprint = _scatter(path, setting), None
+    if path.footprint is not None:
+        scattered, footprint = _scattered_footprint(path, setting)
     moved = path._replace(
         ray=scattered.ray,
+        footprint=footprint,
         last=path.surface,
         throughput=scattered.throughput,
         spectral=scattered.spectral,
@@ -1036,7 +1053,15 @@ def _one_way(path: Path, setting: Setting) -> Path:
         shown = _lamplight(path, counts, scattered, setting)
         radiance = tuple(r + x for r, x in zip(radiance, shown, strict=True))
     spheres = all_spheres(tables.world, plan, setting.one)
-    surface = nearest(moved.ray, tables.world, plan, path.surface, spheres)
+    if plan.filtered and scattered.share is not None:
+        radiance = _against_chance(radiance, counts, path.throughput, scattered.share, setting)
+    if footprint is None:
+        surface = nearest(moved.ray, tables.world, plan, path.surface, spheres)
+    else:
+        number = setting.draw(path.bounces, plan.numbers_per_bounce)
+        surface, share = _one_of_seen(moved, spheres, setting, number)
+        radiance = _against_chance(radiance, counts, moved.throughput, share, setting)
+        moved = moved._replace(throughput=tuple(t * share for t in moved.throughput))
     light = emitted(surface, moved, tables, plan, setting.one)
     arrives = counts & scattered.goes_on & (surface >= plan.first_lamp)
     factor = jnp.where(arrives, 1.0, 0.0)
@@ -1044,12 +1069,110 @@ def _one_way(path: Path, setting: Setting) -> Path:
         factor = factor * _chance_weight(surface, scattered, tables, plan)
     radiance = tuple(
         r + jnp.where(arrives, t * factor * x, 0.0)
-        for r, t, x in zip(radiance, scattered.throughput, light, strict=True)
+        for r, t, x in zip(radiance, moved.throughput, light, strict=True)
     )
     goes_on = scattered.goes_on & (surface < plan.first_lamp)
     return _go_on(
         path, moved._replace(surface=surface), goes_on, scattered.differ, radiance, setting
     )
+
+
+def _scattered_footprint(path: Path, setting: Setting) -> tuple[Scattered, tuple[Ray, Ray]]:
+    """What the surface that a path meets does to it, and to its footprint: matte ones end it."""
+
+    def of(ray: Ray) -> tuple[Ray, Scattered]:
+        scattered = _scatter(path._replace(ray=ray), setting)
+        return scattered.ray, scattered
+
+    assert path.footprint is not None
+    _, push, scattered = jax.linearize(of, path.ray, has_aux=True)
+    spread = scattered.matte
+    if setting.plan.fuzzy:
+        spread = path.surface >= setting.plan.balls
+    none = jax.tree.map(jnp.zeros_like, path.ray)
+    across, down = (choose(spread, none, push(edge)) for edge in path.footprint)
+    return scattered, (across, down)
+
+
+def _one_of_seen(
+    moved: Path, spheres: Candidates, setting: Setting, number: Real
+) -> tuple[Array, Real]:
+    """One of the surfaces that a footprint meets, and what it counts.
+
+    Across an outline, and the horizon of a plane, lie two: the nearer one is chosen by the part of
+    the footprint that meets it. The part has a derivative, the chance has none. Outlines of balls
+    are hard.
+
+    Args:
+        moved: the path, with the surface that it leaves as its last.
+        spheres: those that it can meet.
+        setting: the rest.
+        number: in [0, 1).
+    """
+    plan, world, ray, footprint = setting.plan, setting.tables.world, moved.ray, moved.footprint
+    assert footprint is not None
+    first = nearest(ray, world, plan, moved.last, spheres, footprint)
+    part = _part_met(first, ray, footprint, world, plan)
+    # A small part changes by much of itself: it is chosen more often than it is large.
+    certain = jax.lax.stop_gradient(part)
+    chance = jnp.where(certain > 0, 0.5 * (1.0 + certain), 0.0)
+    taken = number < chance
+    behind = nearest(ray, world, plan, moved.last, spheres, None, first)
+    share = jnp.where(taken, part, 1.0 - part)
+    counted = jnp.where(taken, chance, 1.0 - chance)
+    return jnp.where(taken, first, behind), share / jnp.where(counted > 0, counted, 1.0)
+
+
+def _against_chance(
+    radiance: Channels, counts: Array, throughput: Channels, share: Real, setting: Setting
+) -> Channels:
+    """The same radiance, with a derivative of less noise.
+
+    Of ways that are chosen by chance, the derivatives of what each counts are 0 in the mean. Times
+    the background's radiance, near to what is seen on one of them, they take most of the noise out.
+    """
+    plan, tables = setting.plan, setting.tables
+    background = plan.background - plan.balls + tables.first_row
+    change = jnp.where(counts, share - jax.lax.stop_gradient(share), 0.0)
+    return tuple(
+        r - change * jax.lax.stop_gradient(t * _pick(mean, background))
+        for r, t, mean in zip(radiance, throughput, tables.paint.mean, strict=True)
+    )
+
+
+def _part_met(
+    surface: Array, ray: Ray, footprint: tuple[Ray, Ray], world: World, plan: Plan
+) -> Real:
+    """Part of a footprint that meets a surface, were there nothing before it; 1 for balls."""
+    part = jnp.ones_like(ray.direction.x)
+    pointed = all_zero(footprint)
+    if plan.spheres > plan.balls:
+        before_planes = surface < plan.first_plane
+        lamp = (surface >= plan.first_lamp) & (surface < plan.first_lamp + plan.lamps)
+        row = jnp.where(before_planes, surface, surface - plan.first_lamp + plan.first_plane)
+        row = jnp.clip(row, 0, plan.spheres - 1)
+        center, radius = _pick_vector(world.centers, row), _pick(world.radii, row)
+        _, depth, edges = sphere_depth(ray, footprint, center, radius)
+        offset = ray.origin - center
+        outside = offset.dot(offset) > radius * radius * (1.0 + 1e-5)
+        counts = ((before_planes & (surface >= plan.balls)) | lamp) & outside & ~pointed
+        part = jnp.where(counts, covered(depth, *edges), part)
+    if plan.planes:
+        plane = _plane_row(surface, plan)
+        normal = _pick_vector(world.normals, plane)
+        height = (ray.origin - _pick_vector(world.points, plane)).dot(normal)
+        side = jnp.where(height < 0, 1.0, -1.0)
+        tilts = (edge.direction.dot(normal) * side for edge in footprint)
+        on_plane = (surface >= plan.first_plane) & (surface < plan.first_lamp)
+        screen = (surface >= plan.first_lamp + plan.lamps) & (surface < plan.background)
+        horizon = covered(ray.direction.dot(normal) * side, *tilts)
+        part = jnp.where((on_plane | screen) & ~pointed, horizon, part)
+    return part
+
+
+def all_zero(footprint: tuple[Ray, Ray]) -> Array:
+    """Whether a footprint is a point."""
+    return reduce(jnp.logical_and, (leaf == 0 for leaf in jax.tree.leaves(footprint)))
 
 
 def _scatter(path: Path, setting: Setting) -> Scattered:
@@ -1093,7 +1216,13 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
             mix = choose(is_matte, Mix(zero, zero + 1.0, zero + 1.0), mix)
         if media is not None:
             glass = glass_interface(media, cos_i, leaves)
-            mirrored: Array = drawn[0] < jax.lax.stop_gradient(glass.reflectance)
+            chance = jax.lax.stop_gradient(glass.reflectance)
+            if plan.filtered:
+                # What is reflected within a ball moves the faster with its index the longer it
+                # stays: such paths are followed the more often.
+                often, seldom = jnp.sqrt(chance), jnp.sqrt(1.0 - chance)
+                chance = jnp.where(leaves, often / (often + seldom), chance)
+            mirrored: Array = drawn[0] < chance
             if setting.split is not None:
                 assert reflected is not None
                 mirrored, shares, reflected = _parted(
@@ -1101,8 +1230,11 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
                 )
             elif setting.differentiable:
                 share = jnp.where(mirrored, glass.reflectance, 1.0 - glass.reflectance)
-                share = jnp.where(is_glass & (share > 0), share, 1.0)
-                shares = (share / jax.lax.stop_gradient(share),) * plan.channels
+                counted = jnp.where(mirrored, chance, 1.0 - chance)
+                share = jnp.where(is_glass & (counted > 0), share, 1.0)
+                shares = (
+                    share / jnp.where(is_glass & (counted > 0), counted, 1.0),
+                ) * plan.channels
             bent = Mix(*refraction(cos_i, glass.cos_t, glass.eta), zero)
             through = choose(mirrored, Mix(*reflection(cos_i), zero), bent)
             mix = choose(is_glass, through, mix)
@@ -1118,6 +1250,10 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
 
     raw = once(mixed, setting.one)
 
+    def beneath(ray: Ray) -> Vec3:
+        point, outward, _ = _meet(path._replace(ray=ray), setting)
+        return _beneath(point, outward, surface, setting.tables, plan)
+
     def finished() -> Scattered:
         squared = raw.dot(raw)
         # A matte or fuzzy direction may vanish, as it does once in a million.
@@ -1128,9 +1264,11 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
         if plan.fuzzy:
             goes_on = is_matte | is_glass | (direction.dot(facing) > 0)
         sunk = _beneath(point, outward, surface, setting.tables, plan)
-        albedo = painted(
-            surface, lambda at: at, sunk, None, setting.tables, plan, False, setting.one
-        )
+        where: tuple[Callable[[Any], Vec3], Any] = (lambda at: at), sunk
+        if path.footprint is not None:
+            where = beneath, path.ray
+        edges, one = path.footprint, setting.one
+        albedo = painted(surface, *where, edges, setting.tables, plan, False, one)
         throughput = tuple(
             t * jnp.where(is_glass, 1.0, a) for t, a in zip(path.throughput, albedo, strict=True)
         )
@@ -1148,8 +1286,8 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
                     t * jnp.where(now, w, 1.0)
                     for t, w in zip(throughput, setting.weights, strict=True)
                 )
-        ray = Ray(point, direction)
-        return Scattered(ray, throughput, goes_on, differ, is_matte, spectral, reflected)
+        ray, share = Ray(point, direction), shares[0] if setting.differentiable and shares else None
+        return Scattered(ray, throughput, goes_on, differ, is_matte, spectral, reflected, share)
 
     scattered = once(finished, setting.one)
     return (
@@ -1237,12 +1375,20 @@ def _meet(path: Path, setting: Setting) -> tuple[Vec3, Vec3, Real]:
         if plan.matte_planes + plan.metal_planes:
             plane, on_plane = _plane_row(surface, plan), surface >= rows
             normal = _pick_vector(world.normals, plane)
-            flat = ray.origin + ray.direction * _to_plane(ray, plane, on_plane, world)
+            to_plane = _to_plane(ray, plane, on_plane, world)
+            if plan.filtered:  # a footprint may meet what its middle does not
+                to_plane = jnp.abs(to_plane)
+            flat = ray.origin + ray.direction * to_plane
             flat = flat - normal * (flat - _pick_vector(world.points, plane)).dot(normal)
             point, outward = choose(
                 on_plane, (flat, normal), (point, outward) if rows else (flat, normal)
             )
-        return point, outward, ray.direction.dot(outward)
+        cosine = ray.direction.dot(outward)
+        if plan.filtered and plan.matte_planes + plan.metal_planes:
+            height = (ray.origin - _pick_vector(world.points, plane)).dot(normal)
+            against = jnp.where(height < 0, jnp.abs(cosine), -jnp.abs(cosine))
+            cosine = jnp.where(on_plane, against, cosine)
+        return point, outward, cosine
 
     return once(meeting, setting.one)
 
@@ -1355,7 +1501,7 @@ def _lamplight(path: Path, counts: Array, scattered: Scattered, setting: Setting
     tables, plan = setting.tables, setting.plan
     assert scattered.to_lamp is not None
     assert scattered.lamp_share is not None
-    to_lamp = path._replace(ray=scattered.to_lamp)
+    to_lamp = path._replace(ray=scattered.to_lamp, footprint=None)
     ray, spheres = scattered.to_lamp, all_spheres(tables.world, plan, setting.one)
     surface = nearest(ray, tables.world, plan, path.surface, spheres)
     assert scattered.lamp is not None
@@ -1546,7 +1692,8 @@ def _to_the_end(
     loop: Loop,
 ) -> Float[Array, "wavelengths samples pixels channels"]:
     """The radiance of the paths (J, S, P), followed to their ends."""
-    numbers = Numbers(plan.numbers_per_bounce, lanes.seed, plan.dtype)
+    per_bounce = plan.numbers_per_bounce + int(plan.filtered)
+    numbers = Numbers(per_bounce, lanes.seed, plan.dtype)
     starts = numbers.start(lanes.pixel)
     waves, samples, pixels = paths.alive.shape
     rows = tables.paint.mean[0].shape[0] // waves

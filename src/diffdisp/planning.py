@@ -46,6 +46,8 @@ class Plan:
         fuzzy: whether any metal is not smooth.
         nested: whether anything, the camera too, may lie within or across a glass ball.
         soft: whether a ball's outline is averaged over footprints, as what moves it asks for.
+        filtered: whether what a path meets before anything scatters it is averaged over its
+            footprint although paths scatter, as derivatives ask for.
     """
 
     samples: int
@@ -65,6 +67,7 @@ class Plan:
     fuzzy: bool
     nested: bool
     soft: bool = False
+    filtered: bool = False
 
     @property
     def first_plane(self) -> int:

@@ -152,6 +152,7 @@ def _picture(
 ) -> jax.Array:
     """`render` inside a transformation."""
     plan = make_plan(scene, film, samples, depth, dtype or jnp.result_type(float).name)
+    plan = replace(plan, filtered=plan.scattering)
     chunks, place = all_pixels(film, chunk_pixels(film, plan))
     values = render_chunks(
         plan, scene, film_spectrum(film, plan), film_size(film), chunks, run_numbers(plan, seed)

@@ -1,0 +1,65 @@
+"""Derivatives where paths scatter, against differences of hard-edged pictures by the other loop."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import WHITE, ball, ground, matte
+
+from diffdisp.camera import Camera
+from diffdisp.dispersion import Sellmeier
+from diffdisp.film import Film
+from diffdisp.material import Lambertian
+from diffdisp.rendering import render
+from diffdisp.scene import Background, Scene, with_glass
+from diffdisp.texture import Checker2D
+
+N, STEP = 1.52, 4e-3
+FILM = Film(24, 24, np.array([0.55]))
+
+
+def glass(n):
+    """A glass of one index."""
+    return Sellmeier(jnp.zeros(3).at[0].set(n * n - 1), jnp.zeros(3))
+
+
+def scene(camera, *objects):
+    """A glass ball before white, and what else there is."""
+    return Scene(camera, (ball(glass(N)), *objects), Background(WHITE))
+
+
+TILES = ground(Lambertian(Checker2D([0.9] * 3, [0.1] * 3, 0.6)), -1.0)
+FROM_ABOVE = scene(Camera((0, 5, 2), (0, -0.4, 0), vertical_fov=27.0), TILES)
+BEHIND = scene(Camera((0, 0, 4), (0, 0, 0), vertical_fov=34.0), matte(0.2, (0.25, 0.2, -3), 0.5))
+
+
+def picture(of, n, samples, dtype, seed=0):
+    """Radiance (24, 24)."""
+    seen = with_glass(of, 0, glass(n))
+    return render(seen, FILM, samples=samples, dtype=dtype, seed=seed)[..., 0]
+
+
+def differences(of, seed):
+    """The slope in the index by the hard-edged pictures on both sides."""
+    more, less = (
+        np.asarray(picture(of, np.asarray(N + h), 16384, "float32", seed), float)
+        for h in (STEP, -STEP)
+    )
+    return (more - less) / (2 * STEP)
+
+
+@pytest.mark.parametrize(
+    ("of", "most"), [(FROM_ABOVE, 0.25), (BEHIND, 0.2)], ids=["tiles", "outline"]
+)
+def test_slopes_in_the_index(of, most):
+    slope = jax.jit(lambda n: jax.jvp(lambda n: picture(of, n, 256, "float64"), (n,), (1.0,)))
+    value, found = (np.asarray(part) for part in slope(jnp.asarray(N)))
+    assert np.isfinite(found).all()
+    pair = np.stack([differences(of, seed) for seed in (1, 2)])
+    # Two pictures with errors of their own: in the product there is no noise of either.
+    square = np.sum(np.prod(found - pair, axis=0)) / np.sum(np.prod(pair, axis=0))
+    print(f"slope off by {np.sqrt(abs(square)):.3f}")
+    assert square < most**2
+    hard = np.asarray(picture(of, np.asarray(N), 4096, "float32"))
+    print(f"value off by {np.abs(value - hard).mean():.4f} in the mean")
+    assert np.abs(value - hard).mean() < 0.01
