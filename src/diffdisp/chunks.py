@@ -76,11 +76,10 @@ def run_numbers(
     """
     least = 4.0 * float(np.finfo(plan.dtype).eps) if cutoff is None else cutoff
     taken = np.arange(plan.samples) if cells is None else cells[0]
-    count = plan.samples if cells is None else cells.size
-    if plan.filtered:
-        count = footprints(count)
+    samples = plan.samples if cells is None else cells.size
+    count = footprints(samples) if plan.filtered else samples
     columns, rows = sample_grid(count)
-    place = taken * count // (plan.samples if cells is None else cells.size)
+    place = taken * count // samples
     return RunNumbers(
         np.asarray(seed % 2**32, np.uint32),
         np.asarray(least),

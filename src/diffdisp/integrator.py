@@ -1034,8 +1034,10 @@ class Scattered(NamedTuple):
 def _one_way(path: Path, setting: Setting) -> Path:
     """A bounce in a scene with matte or metal surfaces: one way, chosen at once."""
     plan, tables = setting.plan, setting.tables
-    scattered, footprint = _scatter(path, setting), None
-    if path.footprint is not None:
+    footprint: tuple[Ray, Ray] | None = None
+    if path.footprint is None:
+        scattered = _scatter(path, setting)
+    else:
         scattered, footprint = _scattered_footprint(path, setting)
     moved = path._replace(
         ray=scattered.ray,
@@ -1145,7 +1147,7 @@ def _part_met(
 ) -> Real:
     """Part of a footprint that meets a surface, were there nothing before it; 1 for balls."""
     part = jnp.ones_like(ray.direction.x)
-    pointed = all_zero(footprint)
+    pointed = _all_zero(footprint)
     if plan.spheres > plan.balls:
         before_planes = surface < plan.first_plane
         lamp = (surface >= plan.first_lamp) & (surface < plan.first_lamp + plan.lamps)
@@ -1170,7 +1172,7 @@ def _part_met(
     return part
 
 
-def all_zero(footprint: tuple[Ray, Ray]) -> Array:
+def _all_zero(footprint: tuple[Ray, Ray]) -> Array:
     """Whether a footprint is a point."""
     return reduce(jnp.logical_and, (leaf == 0 for leaf in jax.tree.leaves(footprint)))
 
