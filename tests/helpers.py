@@ -140,7 +140,7 @@ def direct(
     """The picture by the loop that fits and transformations use, for any scene."""
     plan = make_plan(scene, film, samples, depth, dtype)
     pixels, place = all_pixels(film, chunk_pixels(film, plan))
-    fixed = plan, without_names(scene), film_spectrum(film, plan), film_size(film)
+    fixed = plan, without_names(scene), film_spectrum(film, plan, seed), film_size(film)
     run = run_numbers(plan, seed)
     values = over_chunks(
         lambda part: np.asarray(render_chunks_jit(*fixed, part, run)), pixels, dtype

@@ -463,7 +463,7 @@ def test_soft_outlines_move_as_the_picture_does():
 
     def moved(by, soft):
         plan = replace(make_plan(bench(), film, 64, 50, "float64"), soft=soft)
-        parts = chunks.film_spectrum(film, plan), chunks.film_size(film)
+        parts = chunks.film_spectrum(film, plan, 0), chunks.film_size(film)
         pixels, place = chunks.all_pixels(film, chunks.chunk_pixels(film, plan))
         run = chunks.run_numbers(plan, 0)
         return chunks.render_chunks(plan, swollen(by), *parts, pixels, run).reshape(-1)[place]

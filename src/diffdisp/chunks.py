@@ -285,8 +285,15 @@ class Spectrum(NamedTuple):
     weights: Float[jax.Array | np.ndarray, "wavelengths samples 3"] | None
 
 
-def film_spectrum(film: Film, plan: Plan) -> Spectrum:
-    """The wavelengths that a film needs under a plan. They are constants, never traced."""
+def film_spectrum(film: Film, plan: Plan, seed: int) -> Spectrum:
+    """The wavelengths that a film needs under a plan. They are constants, never traced.
+
+    Args:
+        film: size, and bands or colour.
+        plan: the static choices.
+        seed: any whole number. Where light scatters, chance decides which wavelength meets which
+            part of the pixel: one pairing for all seeds would be an error that more runs keep.
+    """
     basis = None if film.wavelengths is None else albedo_basis(np.asarray(film.wavelengths))
     if not plan.dispersive:
         return Spectrum(np.array([sum(COLOR_RANGE) / 2]), basis, None)
@@ -297,7 +304,7 @@ def film_spectrum(film: Film, plan: Plan) -> Spectrum:
     # Each sample is followed at a middle wavelength in all channels, and where that path meets
     # dispersive glass, by the same numbers at a wavelength of its own: what this one shows
     # otherwise than the middle one is the dispersion, and hardly anything else of it is noise.
-    wavelengths, _, weights = _strata(plan.samples, 1)
+    wavelengths, _, weights = _strata(plan.samples, 1, seed)
     middle = np.full_like(wavelengths, np.median(wavelengths))
     return Spectrum(
         np.concatenate([middle, wavelengths]),
@@ -310,11 +317,11 @@ WAVES_OF_ANY_PATH = 2
 """Wavelengths of a sample where light scatters: the middle one, and its own."""
 
 
-def with_split_paths(spectrum: Spectrum, plan: Plan) -> Spectrum:
+def with_split_paths(spectrum: Spectrum, plan: Plan, seed: int) -> Spectrum:
     """The spectrum with the wavelengths of samples that the camera sees through glass."""
     if spectrum.weights is None:
         return spectrum
-    wavelengths, _, weights = _strata(plan.samples, plan.wavelengths_per_sample)
+    wavelengths, _, weights = _strata(plan.samples, plan.wavelengths_per_sample, seed)
     return Spectrum(
         np.concatenate([spectrum.wavelengths, wavelengths]),
         None,
@@ -322,7 +329,9 @@ def with_split_paths(spectrum: Spectrum, plan: Plan) -> Spectrum:
     )
 
 
-def _strata(samples: int, count: int) -> tuple[np.ndarray, None, np.ndarray]:
+def _strata(
+    samples: int, count: int, seed: int | None = None
+) -> tuple[np.ndarray, None, np.ndarray]:
     """Wavelengths (count, samples) of a pixel's samples, and what they count in each channel."""
     wavelengths, weights = wavelength_strata(count * samples)
     # Each sample takes every `samples`-th stratum. A step near the golden section keeps the
@@ -330,7 +339,8 @@ def _strata(samples: int, count: int) -> tuple[np.ndarray, None, np.ndarray]:
     step = next(
         k for k in range(round(samples * 0.618) or 1, samples + 1) if np.gcd(k, samples) == 1
     )
-    taken = np.arange(samples) * step % samples + np.arange(count)[:, None] * samples
+    turn = 0 if seed is None else np.random.default_rng(seed % 2**32).integers(samples)
+    taken = (np.arange(samples) + turn) * step % samples + np.arange(count)[:, None] * samples
     return wavelengths[taken], None, weights[taken]
 
 

@@ -921,7 +921,7 @@ def _part(
     """The blocks of `size` pixels with numbers `blocks`, at `samples` · `split`² samples."""
     film = problem.film
     plan = replace(make_plan(problem.scene, film, samples, depth, "float64"), dispersive=True)
-    spectrum = film_spectrum(film, plan)
+    spectrum = film_spectrum(film, plan, seed=0)
     width = film.width // size
     y, x = np.divmod(blocks[:, None], width)
     down, right = np.divmod(np.arange(split**2), split)

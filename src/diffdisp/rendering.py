@@ -133,7 +133,7 @@ def render_progressively(
     """
     dtype = dtype or jnp.result_type(float).name
     check_glasses(scene, *film_range(film))
-    work = _lay_out(scene, film, samples, depth, dtype)
+    work = _lay_out(scene, film, samples, depth, dtype, seed)
     total, passes = np.zeros((), dtype), len(work.cells)
     for number in range(passes):
 
@@ -154,9 +154,8 @@ def _picture(
     plan = make_plan(scene, film, samples, depth, dtype or jnp.result_type(float).name)
     plan = replace(plan, filtered=plan.scattering)
     chunks, place = all_pixels(film, chunk_pixels(film, plan))
-    values = render_chunks(
-        plan, scene, film_spectrum(film, plan), film_size(film), chunks, run_numbers(plan, seed)
-    )
+    fixed = plan, scene, film_spectrum(film, plan, seed), film_size(film)
+    values = render_chunks(*fixed, chunks, run_numbers(plan, seed))
     return values.reshape(-1, film.channels)[place].reshape(film.height, film.width, film.channels)
 
 
@@ -178,7 +177,9 @@ class _Work(NamedTuple):
     tiles: list[Tiles] | None
 
 
-def _lay_out(scene: Scene, film: Film, samples: int, depth: int, dtype: str) -> _Work:
+def _lay_out(
+    scene: Scene, film: Film, samples: int, depth: int, dtype: str, seed: int
+) -> _Work:
     """The work for a picture."""
     whole = make_plan(scene, film, samples, depth, dtype)
     most = min(MOST_SAMPLES, PASS_PATHS // (film.width * film.height))
@@ -190,13 +191,13 @@ def _lay_out(scene: Scene, film: Film, samples: int, depth: int, dtype: str) -> 
         k for k in range(round(samples * 0.382) or 1, samples + 1) if np.gcd(k, samples) == 1
     )
     cells = np.arange(samples) * (step if share < samples else 1) % samples
-    spectrum = film_spectrum(film, whole)
+    spectrum = film_spectrum(film, whole, seed)
     tiles = None
     if plan.scattering:
         if plan.bands and plan.dispersive:  # each band is a picture of its own
             plan = replace(plan, bands=1)
         tiles = visible_tiles(scene, film, plan, tile_edge(share), workers())
-        spectrum = with_split_paths(spectrum, whole)
+        spectrum = with_split_paths(spectrum, whole, seed)
     nameless = scene if plan.scattering else without_names(scene)
     return _Work(plan, nameless, spectrum, cells.reshape(-1, share), tiles)
 
@@ -335,7 +336,7 @@ def compile_ahead(scene: Scene, film: Film, *, samples: int, depth: int, dtype: 
         depth: as in `render`.
         dtype: "float32" or "float64".
     """
-    work = _lay_out(scene, film, samples, depth, dtype)
+    work = _lay_out(scene, film, samples, depth, dtype, seed=0)
     plan = work.plan
     spectrum = _of_pass(work, work.cells[0])
     run = run_numbers(plan, 0, cells=work.cells)
