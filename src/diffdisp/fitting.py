@@ -42,6 +42,7 @@ from diffdisp.chunks import (
 from diffdisp.color import albedo_basis, wavelength_strata
 from diffdisp.dispersion import LINE_C, LINE_D, LINE_F, LINE_G, Sellmeier, domain_error
 from diffdisp.film import Film
+from diffdisp.glass_database import real_glasses
 from diffdisp.glasses import glass_table
 from diffdisp.image import Picture
 from diffdisp.integrator import Lanes, followed_radiance, lane_radiance
@@ -589,8 +590,9 @@ def fit(
             scene: numbers of the scene by name, such as "ball.center", "ball.center.z",
             "screen.tile" or "camera.vertical_fov"; "gain", a factor for each channel of the
             picture; "black", what is added to all of them. They enter the errors of the glass.
-        prior: "none"; "catalogue", a Gaussian in log B, log C over the table's glasses;
-            "fixed-c3", which holds C₃ at its start.
+        prior: "none"; "catalogue", a Gaussian in log B, log C over real glasses: those of the
+            refractiveindex.info database where the package `refractiveindex` is installed, of the
+            table otherwise; "fixed-c3", which holds C₃ at its start.
         noise: standard deviation of the target's values where it is known; otherwise errors are
             estimated from the residual, heteroscedasticity-consistent.
         start: a glass to start from instead of the scene's.
@@ -835,8 +837,7 @@ def _prior(prior: str, C: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.
         return np.zeros(0), np.zeros((0, int(mask.sum())))
     if not mask.all():
         raise ValueError("the catalogue prior needs a start of three terms with B, C above 0")
-    glasses = [g for g in glass_table().values() if np.all(np.r_[g.B, g.C] > 0)]
-    logs = np.log([np.concatenate([g.B, g.C])[_by_C(g.C)] for g in glasses])
+    logs = np.log(real_glasses().terms)
     mean, whiten = logs.mean(0), np.linalg.inv(np.linalg.cholesky(np.cov(logs.T)))
     order = _by_C(C)
     rows = np.zeros((6, 6))
@@ -2083,7 +2084,7 @@ def _summary(
     text = (
         f"{opening} n to {np.max(n_std):.1e} (1 sigma) between {waves.min() * 1e3:.0f}"
         f" and {waves.max() * 1e3:.0f} nm and {known} to better than 10 %"
-        f" ({source}{'' if prior == 'none' else f', with the prior {prior}'})."
+        f" ({source}{_prior_words(prior)})."
     )
     if determined < free:
         text += (
@@ -2093,6 +2094,17 @@ def _summary(
     if own:
         text += f" The last level used what the picture says of itself: {own}."
     return text
+
+
+def _prior_words(prior: str) -> str:
+    """What was known before the picture, if anything was."""
+    if prior == "none":
+        return ""
+    of = ""
+    if prior == "catalogue":
+        glasses = real_glasses()
+        of = f" of {len(glasses.terms)} glasses {glasses.source}"
+    return f", with the prior {prior}{of}"
 
 
 def _clipped_words(count: int, ceiling: float) -> str:

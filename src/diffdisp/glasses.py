@@ -331,7 +331,9 @@ def read_refractiveindex_yaml(path: str | os.PathLike[str]) -> Sellmeier:
 
     file = os.fspath(path)
     try:
-        content = yaml.safe_load(Path(file).read_text(encoding="utf-8"))
+        text = Path(file).read_text(encoding="utf-8")
+        # The one in C reads a long table ten times as fast, where there is one.
+        content = yaml.load(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ValueError(f"{file}: is not a YAML file: {' '.join(str(error).split())}") from error
     entry = _formula_entry(file, content)
