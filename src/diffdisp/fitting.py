@@ -712,7 +712,7 @@ def _expected(problem: Problem, prior: str, noise: float) -> Uncertainty:
     if problem.free.parameters:
         finer = _level(problem, LAST, 1, FEW_SAMPLES, 50, 0, SPLITS[1])
         known = _linearise(problem, finer, at, CUTOFF).columns
-    seen = _linearise(problem, level, at, CUTOFF, known)
+    seen = _linearise(problem, level, at, CUTOFF, known, True)
     # A pixel's weight says how much of its residual is what samples leave open, beside the noise:
     # all residuals, weighed, are to be as large as the noise.
     residual = noise / np.sqrt(np.where(level.weights > 0, level.weights, 1.0))
@@ -979,7 +979,11 @@ def _traced(
         def along(move: Array) -> Array:
             return jax.jvp(of_scene, (coordinates,), (move,))[1]
 
-        value, slopes = jax.vmap(change, out_axes=(None, 0))(tangents)
+        if len(tangents):
+            value, slopes = jax.vmap(change, out_axes=(None, 0))(tangents)
+        else:
+            value = of_index(index)
+            slopes = jnp.zeros((0, *value.shape), value.dtype)
         if places:
             moves = jnp.eye(len(places), dtype=plan.dtype)
             slopes = jnp.concatenate([jax.vmap(along)(moves), slopes])
@@ -992,11 +996,18 @@ _traced_jit = jax.jit(_traced, static_argnums=(0, 1, 2), compiler_options=OPTION
 
 
 def _trace(
-    problem: Problem, part: Part, at: Point, seed: int, cutoff: float, along_scene: bool
+    problem: Problem,
+    part: Part,
+    at: Point,
+    seed: int,
+    cutoff: float,
+    along_scene: bool,
+    along_index: bool = True,
 ) -> Float[np.ndarray, "blocks derivatives channels"]:
     """Radiance of a part's blocks, and its changes as `_traced` has them.
 
-    Those along the scene's numbers cost several times as much as all else: only if asked for.
+    Those along the scene's numbers cost several times as much as all else, and those along the
+    index more than the radiance: only if asked for.
     """
     waves, free = np.asarray(part.spectrum.wavelengths), problem.free
     coefficients = problem.unknowns.coefficients
@@ -1008,6 +1019,7 @@ def _trace(
         scene = _with_others(problem, at.others)
         places, units, coordinates = (), units[:0], coordinates[:0]
     scene = without_names(scene)
+    tangents = part.tangents if along_index else part.tangents[:0]
 
     # A ball's outline moves with it; slopes of points of it are far from a pixel's. Of a picture
     # that is drawn as the target was they are the true ones all the same.
@@ -1015,7 +1027,7 @@ def _trace(
     plan = replace(part.plan, soft=soft and bool(places))
 
     def trace(chunks: Pixels) -> np.ndarray:
-        fixed = (scene, part.spectrum, size, chunks, run, index, part.tangents)
+        fixed = (scene, part.spectrum, size, chunks, run, index, tangents)
         return np.asarray(_traced_jit(plan, problem.ball, places, *fixed, coordinates, units))
 
     values = over_chunks(trace, part.chunks, "float64")
@@ -1023,7 +1035,12 @@ def _trace(
 
 
 def _linearise(
-    problem: Problem, level: Level, at: Point, cutoff: float, known: Columns | None = None
+    problem: Problem,
+    level: Level,
+    at: Point,
+    cutoff: float,
+    known: Columns | None = None,
+    of_index: bool = False,
 ) -> Linearised:
     """The picture and its slopes at a point, reduced to what a step needs.
 
@@ -1032,21 +1049,25 @@ def _linearise(
         level: the resolution.
         at: the point.
         cutoff: part of its light with which a path ends.
-        known: slopes along the scene's numbers from another point, so near that they still hold.
+        known: slopes along the scene's numbers from another point, so near that they still hold,
+            or from fewer samples.
+        of_index: whether those of the index are taken from there too.
     """
     free, channels = problem.free, problem.film.channels
     count, bands = len(free.parameters), problem.film.wavelengths is not None
     tangents, along = len(level.parts[0].tangents), count if known is None else 0
-    joined = np.zeros((len(level.target), 1 + along + tangents, channels))
+    traced_tangents = 0 if of_index else tangents
+    joined = np.zeros((len(level.target), 1 + along + traced_tangents, channels))
     for part in level.parts:
-        traced = _trace(problem, part, at, level.seed, cutoff, known is None)
+        traced = _trace(problem, part, at, level.seed, cutoff, known is None, not of_index)
         joined[part.rows] += part.share * traced
     gains, black = free.exposure(at.others)
     joined *= gains
     radiance, slopes = joined[:, :1], joined[:, 1:]
     if known is not None:
-        again = known.values[..., :count].transpose(1, 2, 0)
-        slopes = np.concatenate([again, slopes], axis=1)
+        again = known.values.transpose(1, 2, 0)
+        of_it = again[:, again.shape[1] - tangents :] if of_index else slopes
+        slopes = np.concatenate([again[:, :count], of_it], axis=1)
     # The gains' coordinates are logarithms: the slope along one is what its channel shows.
     levels = np.full((len(joined), free.blacks, channels), free.brightest)
     shown = [slopes[:, :count], radiance[:, : min(free.gains, 1)], levels, slopes[:, count:]]
@@ -1280,7 +1301,7 @@ def _descend(
         cutoff: part of its light with which a path ends.
         most: pictures to trace at most.
         small: a step that changes the picture by less than this part of its noise is the last.
-        along: where slopes along the scene's numbers are taken; by default on the level itself.
+        along: where slopes are taken; by default on the level itself.
         smooth: whether B and C move along the `Coefficients.smooth` directions alone.
     """
 
@@ -1295,7 +1316,7 @@ def _descend(
     def look(at: Point, known: Columns | None = None) -> Linearised:
         if known is None and along is not None:
             known = _linearise(problem, along, at, cutoff).columns
-        return _linearise(problem, level, at, cutoff, known)
+        return _linearise(problem, level, at, cutoff, known, along is not None)
 
     unknowns = problem.unknowns
     least = LEAST_CHANGE[0] if problem.film.wavelengths is not None else LEAST_CHANGE[1]
@@ -1686,7 +1707,10 @@ def _search(problem: Problem, target: Picture) -> "tuple[Level, Descent]":
         many = _level(problem, LAST, 1, FEW_SAMPLES, depth, seed, SPLITS[0])
         best = _descend(problem, level, best.at, CUTOFF, 20, 1.0)
         level, at = _refined(problem, best, many, depth)
-        if problem.free.parameters:  # slopes next to an outline are steep too
+        # Few samples tell the slopes, and many what is left: at its end a fit has to know this to
+        # a part of the noise, and those to a part of themselves.
+        along = many
+        if problem.free.parameters:  # slopes next to an outline are steep
             along = _level(problem, LAST, 1, FEW_SAMPLES, depth, seed, SPLITS[1])
     else:
         level, at = _level(problem, LAST, 1, target.samples, depth, seed), best.at
