@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from helpers import BK7
 
 from diffdisp import fitting
 from diffdisp.glass_database import real_glasses
 from diffdisp.glasses import glass_table
-from helpers import BK7
 
 SOLD = [glass for glass in glass_table().values() if np.all(np.r_[glass.B, glass.C] > 0)][:10]
 """Glasses of three terms, C rising."""

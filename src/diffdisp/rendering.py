@@ -177,9 +177,7 @@ class _Work(NamedTuple):
     tiles: list[Tiles] | None
 
 
-def _lay_out(
-    scene: Scene, film: Film, samples: int, depth: int, dtype: str, seed: int
-) -> _Work:
+def _lay_out(scene: Scene, film: Film, samples: int, depth: int, dtype: str, seed: int) -> _Work:
     """The work for a picture."""
     whole = make_plan(scene, film, samples, depth, dtype)
     most = min(MOST_SAMPLES, PASS_PATHS // (film.width * film.height))
