@@ -49,7 +49,7 @@ def differences(of, seed):
 
 
 @pytest.mark.parametrize(
-    ("of", "most"), [(FROM_ABOVE, 0.25), (BEHIND, 0.2)], ids=["tiles", "outline"]
+    ("of", "most"), [(FROM_ABOVE, 0.2), (BEHIND, 0.2)], ids=["tiles", "outline"]
 )
 def test_slopes_in_the_index(of, most):
     slope = jax.jit(lambda n: jax.jvp(lambda n: picture(of, n, 256, "float64"), (n,), (1.0,)))
@@ -63,3 +63,11 @@ def test_slopes_in_the_index(of, most):
     hard = np.asarray(picture(of, np.asarray(N), 4096, "float32"))
     print(f"value off by {np.abs(value - hard).mean():.4f} in the mean")
     assert np.abs(value - hard).mean() < 0.01
+
+
+def test_a_white_ball_before_white_is_not_seen():
+    # A footprint that grazes it scatters from its outside: from its inside half of them saw no
+    # light, and the picture was 2e-3 too dark. The noise of its mean is 5e-4.
+    white = scene(BEHIND.camera, matte(1.0, (0.25, 0.2, -3), 0.5))
+    value = jax.jit(lambda n: jax.jvp(lambda n: picture(white, n, 256, "float64"), (n,), (1.0,))[0])
+    assert abs(np.mean(value(jnp.asarray(N))) - 1) < 1.2e-3

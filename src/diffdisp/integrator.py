@@ -1217,13 +1217,18 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
         if after_matte > first_matte:
             mix = choose(is_matte, Mix(zero, zero + 1.0, zero + 1.0), mix)
         if media is not None:
-            glass = glass_interface(media, cos_i, leaves)
+            glass, angle = glass_interface(media, cos_i, leaves), cos_i
             chance = jax.lax.stop_gradient(glass.reflectance)
             if plan.filtered:
-                # What is reflected within a ball moves the faster with its index the longer it
-                # stays: such paths are followed the more often.
-                often, seldom = jnp.sqrt(chance), jnp.sqrt(1.0 - chance)
-                chance = jnp.where(leaves, often / (often + seldom), chance)
+                assert path.footprint is not None
+                spread = _all_zero(path.footprint)
+                outer = jnp.where(leaves, glass.cos_t, cos_i)
+                still = spread & (outer < GRAZING)
+                glass, angle = choose(still, jax.lax.stop_gradient((glass, angle)), (glass, angle))
+                # Once scattered, paths that all count alike leave no noise of what is reflected
+                # but by what is seen otherwise than the background: see `_against_chance`.
+                followed = leaves & ~spread & (chance > 0)
+                chance = jnp.where(followed, jnp.maximum(chance, STAYING), chance)
             mirrored: Array = drawn[0] < chance
             if setting.split is not None:
                 assert reflected is not None
@@ -1237,8 +1242,8 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
                 shares = (
                     share / jnp.where(is_glass & (counted > 0), counted, 1.0),
                 ) * plan.channels
-            bent = Mix(*refraction(cos_i, glass.cos_t, glass.eta), zero)
-            through = choose(mirrored, Mix(*reflection(cos_i), zero), bent)
+            bent = Mix(*refraction(angle, glass.cos_t, glass.eta), zero)
+            through = choose(mirrored, Mix(*reflection(angle), zero), bent)
             mix = choose(is_glass, through, mix)
             differ = jnp.asarray(glass.differ | ~is_glass)
         return mix, unit, differ, shares, reflected
@@ -1298,6 +1303,16 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
         else scattered
     )
 
+
+STAYING = 0.4
+"""Least chance of a reflection within a ball that the camera sees, where derivatives are wanted of
+what scatters: such images move the faster with the index the longer light stays. Measured on a ball
+over a matte ground: 0.14 off by the square root of the reflectance, 0.12 by this, 0.125 by 0.5."""
+
+GRAZING = 0.1
+"""Cosine outside a ball below which scattered light has no derivative by its angle to the glass.
+That grows as one over the cosine, so that its variance has no bound, while ever less light comes so
+flat. Measured as above: without, single paths spoil one picture in six by 0.3."""
 
 FOLLOWED = 4.0
 """How much more often a reflected path is followed than light goes its way: noise against time."""
@@ -1386,6 +1401,11 @@ def _meet(path: Path, setting: Setting) -> tuple[Vec3, Vec3, Real]:
                 on_plane, (flat, normal), (point, outward) if rows else (flat, normal)
             )
         cosine = ray.direction.dot(outward)
+        if plan.filtered and sphere is not None:
+            # What only grazes a sphere meets its outside, wherever rounding puts the foot.
+            offset = ray.origin - center
+            outside = offset.dot(offset) > radius * radius * (1.0 + 1e-5)
+            cosine = jnp.where((surface >= plan.balls) & outside, -jnp.abs(cosine), cosine)
         if plan.filtered and plan.matte_planes + plan.metal_planes:
             height = (ray.origin - _pick_vector(world.points, plane)).dot(normal)
             against = jnp.where(height < 0, jnp.abs(cosine), -jnp.abs(cosine))
