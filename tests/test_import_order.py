@@ -11,6 +11,7 @@ ORDER = (
     "vector",
     "dispersion",
     "glasses",
+    "glass_database",
     "fresnel",
     "geometry",
     "texture",
