@@ -51,8 +51,8 @@ Step = Callable[[int], float]
 """A gradient, from the number of a repeat."""
 
 
-def ours(size: int, samples: int) -> tuple[Step, float]:
-    """A step of diffdisp, and the difference of its loss."""
+def ours(size: int, counts: list[int]) -> tuple[list[Step], float]:
+    """Steps of diffdisp, for each number of samples, and the difference of its loss."""
     wall = Object(Plane([0, 0, WALL], [0, 0, 1]), Emitter(Checker2D([1.0] * 3, [0.0] * 3, 1.0)))
     ball = Object(Sphere([0.0, 0, 0], 1.0), Dielectric(Sellmeier([1.0, 0, 0], [0.0, 0, 0])))
     scene = Scene(Camera([0.0, 0, EYE], [0.0, 0, 0], vertical_fov=FIELD_OF_VIEW), [ball, wall])
@@ -67,12 +67,16 @@ def ours(size: int, samples: int) -> tuple[Step, float]:
         picture(np.float64(n), CONVERGED) for n in (TARGET, INDEX + STEP, INDEX - STEP)
     )
     losses = [float(np.mean((np.asarray(seen, float) - target) ** 2)) for seen in moved]
-    gradient = jax.jit(jax.grad(lambda n: jnp.mean((picture(n, samples) - target) ** 2)))
-    return lambda _: float(gradient(jnp.asarray(INDEX))), (losses[0] - losses[1]) / (2 * STEP)
+
+    def step(samples: int) -> Step:
+        gradient = jax.jit(jax.grad(lambda n: jnp.mean((picture(n, samples) - target) ** 2)))
+        return lambda _: float(gradient(jnp.asarray(INDEX)))
+
+    return [step(samples) for samples in counts], (losses[0] - losses[1]) / (2 * STEP)
 
 
 def mitsubas(size: int, samples: int, depth: int) -> tuple[Step, float]:
-    """The same of Mitsuba."""
+    """A step of Mitsuba, and the difference of its loss."""
     import drjit as dr
     import mitsuba as mi
 
@@ -81,8 +85,10 @@ def mitsubas(size: int, samples: int, depth: int) -> tuple[Step, float]:
     cells = np.indices((CELLS, CELLS)).sum(axis=0) % 2
     checker = np.repeat(cells[:, :, None], 3, axis=2).astype(np.float32)
     bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(checker), "raw": True, "filter_type": "nearest"}
-    glass = {"type": "roughdielectric", "distribution": "ggx", "alpha": ROUGHNESS}
     film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}
+    film |= {"pixel_format": "rgb", "component_format": "float32"}
+    glass = {"type": "roughdielectric", "distribution": "ggx", "alpha": ROUGHNESS}
+    glass |= {"int_ior": INDEX, "ext_ior": 1.0}
     scene = mi.load_dict(
         {
             "type": "scene",
@@ -92,7 +98,7 @@ def mitsubas(size: int, samples: int, depth: int) -> tuple[Step, float]:
                 "fov": FIELD_OF_VIEW,
                 "fov_axis": "y",
                 "to_world": to.look_at(origin=[0, 0, EYE], target=[0, 0, 0], up=[0, 1, 0]),
-                "film": film | {"pixel_format": "rgb", "component_format": "float32"},
+                "film": film,
                 "sampler": {"type": "independent", "sample_count": samples},
             },
             "wall": {
@@ -101,10 +107,7 @@ def mitsubas(size: int, samples: int, depth: int) -> tuple[Step, float]:
                 "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}},
                 "emitter": {"type": "area", "radiance": bitmap},
             },
-            "glass": {
-                "type": "sphere",
-                "bsdf": glass | {"int_ior": INDEX, "ext_ior": 1.0},
-            },
+            "glass": {"type": "sphere", "bsdf": glass},
         }
     )
     params = mi.traverse(scene)
@@ -146,7 +149,11 @@ def main() -> None:
     add("--depth", type=int, default=6, help="of Mitsuba's; ours has 50")
     add("--runs", type=int, default=9, help="steps of each, of which medians")
     options = parser.parse_args()
-    programs = {f"diffdisp, {count}": ours(options.size, count) for count in options.samples}
+    steps, difference = ours(options.size, options.samples)
+    programs = {
+        f"diffdisp, {count}": (step, difference)
+        for count, step in zip(options.samples, steps, strict=True)
+    }
     try:
         its = mitsubas(options.size, options.its_samples, options.depth)
         programs[f"Mitsuba {version('mitsuba')}, {options.its_samples}"] = its

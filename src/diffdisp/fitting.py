@@ -42,7 +42,7 @@ from diffdisp.chunks import (
 from diffdisp.color import albedo_basis, wavelength_strata
 from diffdisp.dispersion import LINE_C, LINE_D, LINE_F, LINE_G, Sellmeier, domain_error
 from diffdisp.film import Film
-from diffdisp.glass_database import real_glasses
+from diffdisp.glass_database import by_C, real_glasses
 from diffdisp.glasses import glass_table
 from diffdisp.image import Picture
 from diffdisp.integrator import Lanes, followed_radiance, lane_radiance
@@ -708,11 +708,9 @@ def _expected(problem: Problem, prior: str, noise: float) -> Uncertainty:
     many = _level(problem, LAST, 1, FEW_SAMPLES, 50, 0, SPLITS[0])
     some = _linearise(problem, many, at, CUTOFF)
     level = _more_samples(problem, many, few, some, 50, noise)
-    known = some.columns
-    if problem.free.parameters:
-        finer = _level(problem, LAST, 1, FEW_SAMPLES, 50, 0, SPLITS[1])
-        known = _linearise(problem, finer, at, CUTOFF).columns
-    seen = _linearise(problem, level, at, CUTOFF, known, True)
+    along = _for_slopes(problem, many, 50, 0)
+    known = (some if along is many else _linearise(problem, along, at, CUTOFF)).columns
+    seen = _linearise(problem, level, at, CUTOFF, known, of_index=True)
     # A pixel's weight says how much of its residual is what samples leave open, beside the noise:
     # all residuals, weighed, are to be as large as the noise.
     residual = noise / np.sqrt(np.where(level.weights > 0, level.weights, 1.0))
@@ -839,16 +837,10 @@ def _prior(prior: str, C: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.
         raise ValueError("the catalogue prior needs a start of three terms with B, C above 0")
     logs = np.log(real_glasses().terms)
     mean, whiten = logs.mean(0), np.linalg.inv(np.linalg.cholesky(np.cov(logs.T)))
-    order = _by_C(C)
+    order = by_C(C)
     rows = np.zeros((6, 6))
     rows[:, order] = whiten
     return whiten @ mean, rows
-
-
-def _by_C(C: Array) -> np.ndarray:
-    """Order (6,) of B1 B2 B3 C1 C2 C3 in which C rises."""
-    order = np.argsort(C)
-    return np.concatenate([order, order + 3])
 
 
 def _level(
@@ -1002,7 +994,7 @@ def _trace(
     seed: int,
     cutoff: float,
     along_scene: bool,
-    along_index: bool = True,
+    along_index: bool,
 ) -> Float[np.ndarray, "blocks derivatives channels"]:
     """Radiance of a part's blocks, and its changes as `_traced` has them.
 
@@ -1316,7 +1308,7 @@ def _descend(
     def look(at: Point, known: Columns | None = None) -> Linearised:
         if known is None and along is not None:
             known = _linearise(problem, along, at, cutoff).columns
-        return _linearise(problem, level, at, cutoff, known, along is not None)
+        return _linearise(problem, level, at, cutoff, known, of_index=along is not None)
 
     unknowns = problem.unknowns
     least = LEAST_CHANGE[0] if problem.film.wavelengths is not None else LEAST_CHANGE[1]
@@ -1387,6 +1379,23 @@ def _refined(problem: Problem, few: Descent, level: Level, depth: int) -> tuple[
     residual = np.abs(some.score)[some.weight > 0]
     shown = _deviation(residual, np.ones_like(residual))
     return _more_samples(problem, level, few.lin, some, depth, shown), at
+
+
+def _for_slopes(problem: Problem, many: Level, depth: int, seed: int) -> Level:
+    """The whole picture from which the last level takes its slopes.
+
+    Few samples tell the slopes, and many what is left: at its end a fit has to know this to a part
+    of the noise, and those to a part of themselves.
+
+    Args:
+        problem: what stays the same.
+        many: the whole picture with as many samples as most pixels get.
+        depth: segments of a path.
+        seed: of the render.
+    """
+    if problem.free.parameters:  # slopes next to an outline are steep
+        return _level(problem, LAST, 1, FEW_SAMPLES, depth, seed, SPLITS[1])
+    return many
 
 
 def _more_samples(
@@ -1707,11 +1716,7 @@ def _search(problem: Problem, target: Picture) -> "tuple[Level, Descent]":
         many = _level(problem, LAST, 1, FEW_SAMPLES, depth, seed, SPLITS[0])
         best = _descend(problem, level, best.at, CUTOFF, 20, 1.0)
         level, at = _refined(problem, best, many, depth)
-        # Few samples tell the slopes, and many what is left: at its end a fit has to know this to
-        # a part of the noise, and those to a part of themselves.
-        along = many
-        if problem.free.parameters:  # slopes next to an outline are steep
-            along = _level(problem, LAST, 1, FEW_SAMPLES, depth, seed, SPLITS[1])
+        along = _for_slopes(problem, many, depth, seed)
     else:
         level, at = _level(problem, LAST, 1, target.samples, depth, seed), best.at
     best = _descend(problem, level, at, CUTOFF, 30, LINEAR_STEP, along)
@@ -1906,7 +1911,7 @@ def _whole_picture(problem: Problem, level: Level, end: Descent, stopped: bool) 
         like, (gains, black) = level.parts[0], problem.free.exposure(end.at.others)
         own = np.arange(len(rest))
         part = _part(problem, 1, like.plan.samples, like.plan.depth, rest, own, like.split)
-        traced = _trace(problem, part, end.at, level.seed, CUTOFF, False)
+        traced = _trace(problem, part, end.at, level.seed, CUTOFF, False, True)
         blocks[rest] = traced[:, 0] * gains + black
     return blocks.reshape(problem.target.shape)
 
@@ -2019,7 +2024,7 @@ def _in_order(
     coefficients: Coefficients, B: np.ndarray, C: np.ndarray, covariance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Terms by rising C, as catalogues print them, where the start had them so."""
-    order = _by_C(C)
+    order = by_C(C)
     if np.any(np.diff(coefficients.C) < 0):
         order = np.arange(6)
     return B[order[:3]], C[order[:3]], covariance[np.ix_(order, order)]

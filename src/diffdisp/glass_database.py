@@ -10,6 +10,7 @@ import numpy as np
 
 from diffdisp.dispersion import Sellmeier
 from diffdisp.glasses import glass_table, read_refractiveindex_yaml
+from diffdisp.vector import Array
 
 PACKAGE = "refractiveindex"
 """Holds the database itself since its version 1.2; earlier ones fetched it at first use."""
@@ -30,10 +31,10 @@ class RealGlasses(NamedTuple):
 def real_glasses() -> RealGlasses:
     """The optical glasses of all makers in the database; those of our table without the package."""
     folder = _database()
-    terms = _terms(_optical_glasses(folder)) if folder is not None else np.zeros((0, 6))
+    terms = _optical_terms(folder) if folder is not None else np.zeros((0, 6))
     if len(terms) > terms.shape[1]:  # enough to tell how the six vary together
         return RealGlasses(terms, "of the refractiveindex.info database")
-    return RealGlasses(_terms(tuple(glass_table().values())), "of the table")
+    return RealGlasses(_terms(list(glass_table().values())), "of the table")
 
 
 def _database() -> Path | None:
@@ -46,22 +47,28 @@ def _database() -> Path | None:
 
 
 @functools.cache
-def _optical_glasses(folder: Path) -> tuple[Sellmeier, ...]:
-    """The Sellmeier glasses among the makers' optical glasses, 1700 files, read in a second."""
+def _optical_terms(folder: Path) -> np.ndarray:
+    """`RealGlasses.terms` of the makers' optical glasses: 1700 files, read in a second."""
     glasses = []
     for file in sorted(folder.glob("specs/*/optical/*.yml")):
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # n in vacuum: its logarithms are the same here
+            # An index or a wavelength in vacuum: 3e-4 is nothing beside how glasses differ.
+            warnings.simplefilter("ignore")
             try:
                 glasses.append(read_refractiveindex_yaml(file))
             except ValueError:  # another formula, or a table
                 continue
-    return tuple(glasses)
+    return _terms(glasses)
 
 
-def _terms(glasses: tuple[Sellmeier, ...]) -> np.ndarray:
+def _terms(glasses: list[Sellmeier]) -> np.ndarray:
     """B and C (glasses, 6) of those that have three terms above 0, C rising."""
-    B, C = (np.array([getattr(glass, name) for glass in glasses]).reshape(-1, 3) for name in "BC")
-    order = np.argsort(C, axis=1)
-    terms = np.concatenate([np.take_along_axis(part, order, 1) for part in (B, C)], axis=1)
+    rows = [np.concatenate([glass.B, glass.C])[by_C(glass.C)] for glass in glasses]
+    terms = np.reshape(rows, (-1, 6))
     return np.unique(terms[(terms > 0).all(axis=1)], axis=0)
+
+
+def by_C(C: Array) -> np.ndarray:
+    """Order (6,) of B1 B2 B3 C1 C2 C3 in which C rises."""
+    order = np.argsort(C)
+    return np.concatenate([order, order + 3])

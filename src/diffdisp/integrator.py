@@ -1155,8 +1155,7 @@ def _part_met(
         row = jnp.clip(row, 0, plan.spheres - 1)
         center, radius = _pick_vector(world.centers, row), _pick(world.radii, row)
         _, depth, edges = sphere_depth(ray, footprint, center, radius)
-        offset = ray.origin - center
-        outside = offset.dot(offset) > radius * radius * (1.0 + 1e-5)
+        outside = _starts_outside(ray, center, radius)
         counts = ((before_planes & (surface >= plan.balls)) | lamp) & outside & ~pointed
         part = jnp.where(counts, covered(depth, *edges), part)
     if plan.planes:
@@ -1170,6 +1169,12 @@ def _part_met(
         horizon = covered(ray.direction.dot(normal) * side, *tilts)
         part = jnp.where((on_plane | screen) & ~pointed, horizon, part)
     return part
+
+
+def _starts_outside(ray: Ray, center: Vec3, radius: Real) -> Array:
+    """Whether a ray starts outside a sphere, and not on it or within rounding of that."""
+    offset = ray.origin - center
+    return jnp.asarray(offset.dot(offset) > radius * radius * (1.0 + 1e-5))
 
 
 def _all_zero(footprint: tuple[Ray, Ray]) -> Array:
@@ -1307,12 +1312,13 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
 STAYING = 0.4
 """Least chance of a reflection within a ball that the camera sees, where derivatives are wanted of
 what scatters: such images move the faster with the index the longer light stays. Measured on a ball
-over a matte ground: 0.14 off by the square root of the reflectance, 0.12 by this, 0.125 by 0.5."""
+over a matte ground, means of six: 0.13 off by the square root of the reflectance over the sum with
+that of the rest, 0.12 by this, 0.125 by 0.5."""
 
 GRAZING = 0.1
 """Cosine outside a ball below which scattered light has no derivative by its angle to the glass.
 That grows as one over the cosine, so that its variance has no bound, while ever less light comes so
-flat. Measured as above: without, single paths spoil one picture in six by 0.3."""
+flat. Measured as above, means of eight: 0.124 off, and without 0.139, by a few single paths."""
 
 FOLLOWED = 4.0
 """How much more often a reflected path is followed than light goes its way: noise against time."""
@@ -1403,8 +1409,7 @@ def _meet(path: Path, setting: Setting) -> tuple[Vec3, Vec3, Real]:
         cosine = ray.direction.dot(outward)
         if plan.filtered and sphere is not None:
             # What only grazes a sphere meets its outside, wherever rounding puts the foot.
-            offset = ray.origin - center
-            outside = offset.dot(offset) > radius * radius * (1.0 + 1e-5)
+            outside = _starts_outside(ray, center, radius)
             cosine = jnp.where((surface >= plan.balls) & outside, -jnp.abs(cosine), cosine)
         if plan.filtered and plan.matte_planes + plan.metal_planes:
             height = (ray.origin - _pick_vector(world.points, plane)).dot(normal)
