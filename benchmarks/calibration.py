@@ -11,11 +11,12 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from typing import Any
 
 import jax
 import numpy as np
-from record import TARGET_GLASS, TARGET_SCENE, print_table, write_record
+from record import TARGET_GLASS, TARGET_SCENE, machine, print_table, recorded, write_record
 
 from diffdisp import (
     Dielectric,
@@ -99,7 +100,7 @@ def scores(result: FitResult) -> dict[str, list[float]]:
 
 
 def calibrate(case: Case, film: Film, repeats: int) -> list[dict[str, Any]]:
-    """Figures of the z-scores of one case."""
+    """Figures of the z-scores of one case; Ctrl-C ends it with the fits that are done."""
     start = load_scene(str(TARGET_SCENE))
     shown = with_glass(start, 0, named_glass(TARGET_GLASS))
     shown = displaced(shown) if "ball.center" in case.free else shown
@@ -111,14 +112,22 @@ def calibrate(case: Case, film: Film, repeats: int) -> list[dict[str, Any]]:
     for seed in range(repeats):
         noisy = clean + case.noise(clean, np.random.default_rng(seed))
         begun = time.perf_counter()
-        result = fit(start, Picture(noisy, film.wavelengths), free=case.free, noise=case.given)
+        try:
+            result = fit(start, Picture(noisy, film.wavelengths), free=case.free, noise=case.given)
+        except KeyboardInterrupt:
+            break
+        if result.stopped:
+            break
         seconds.append(time.perf_counter() - begun)
         failed += not result.converged
         errors.append(result.n_d_std)
         for name, values in scores(result).items():
             found[name] += values
-        if sys.stderr.isatty():
-            print(f"{case.name}: {seed + 1} of {repeats}", file=sys.stderr)
+        n_d = np.array(found["n_d"])
+        print(
+            f"{case.name}: {seed + 1} of {repeats}, z {np.mean(n_d):.2f} ± {np.std(n_d):.2f}",
+            file=sys.stderr,
+        )
     return [
         {
             "case": case.name,
@@ -127,9 +136,11 @@ def calibrate(case: Case, film: Film, repeats: int) -> list[dict[str, Any]]:
             "std": float(np.std(z)),
             "within_1": float(np.mean(np.abs(z) < 1)),
             "n_d_std": statistics.median(errors),
-            "fits": repeats,
+            "fits": len(seconds),
             "failed": failed,
             "fit_s": statistics.median(seconds),
+            "cores": machine()["cores"],
+            "date": datetime.now(UTC).date().isoformat(),
         }
         for name, z in found.items()
         if z
@@ -141,21 +152,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     add = parser.add_argument
     add("--repeats", type=int, default=200, help="fits of each case")
-    add("--moved-repeats", type=int, default=50, help="of that whose ball is looked for")
+    add("--moved-repeats", type=int, default=200, help="of that whose ball is looked for")
     add("--size", type=int, default=48, help="pixels along each edge")
     add("--bands", type=int, default=8, help="equal ones from 400 to 700 nm")
     add("--only", nargs="+", choices=[case.name for case in CASES], help="of the cases")
     options = parser.parse_args()
     film = Film(options.size, options.size, band_middles(400.0, 700.0, options.bands))
-    rows: list[dict[str, Any]] = []
-    for case in CASES:
-        if options.only and case.name not in options.only:
-            continue
+    run = [case for case in CASES if not options.only or case.name in options.only]
+    # Hours of work: what is done is kept, whatever becomes of the rest, and until it is done anew.
+    rows: list[dict[str, Any]] = recorded("calibration")["scores"]
+    for case in run:
         moved = "ball.center" in case.free
         found = calibrate(case, film, options.moved_repeats if moved else options.repeats)
         print_table(list(found[0]), [list(row.values()) for row in found])
-        rows += found
-        # Hours of work: what is done is kept, whatever becomes of the rest.
+        rows = [row for row in rows if row["case"] != case.name] + found
         write_record("calibration", vars(options) | {"noise": NOISE}, {"scores": rows})
 
 

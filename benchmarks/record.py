@@ -70,6 +70,11 @@ def write_record(name: str, settings: dict[str, Any], figures: Any) -> None:
     print(f"written: {path.relative_to(ROOT)}")
 
 
+def recorded(name: str) -> Any:
+    """The figures of results/`name`.json."""
+    return json.loads((RESULTS / f"{name}.json").read_text())["figures"]
+
+
 def print_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     """Print rows under their head; numbers with four digits."""
     cells = [list(head)] + [[_cell(value) for value in row] for row in rows]
