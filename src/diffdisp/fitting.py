@@ -123,6 +123,12 @@ POLISH = 6
 """Steps more, at most, where more than the glass is free: a scene's numbers move the picture less
 nearly in straight lines."""
 
+FEW_STEP = 10.0
+"""Where numbers of the scene are free, a step that changes the picture of few samples by less than
+this many times its noise is the last on it: its outlines are rough, so that steps wander by 3 to 6
+times that noise without end, and the last level starts 20 times its own away whether they do or
+not."""
+
 NEAR_STEP, ROUGH = 30.0, 1.1
 """A step that changes the picture by less than this many times its noise is taken though the sum
 of squares rises a little: some samples jump where a silhouette crosses them, by more than what is
@@ -1714,7 +1720,8 @@ def _search(problem: Problem, target: Picture) -> "tuple[Level, Descent]":
     if target.samples is None:
         level = _level(problem, FEW, 1, FEW_SAMPLES, depth, seed)
         many = _level(problem, LAST, 1, FEW_SAMPLES, depth, seed, SPLITS[0])
-        best = _descend(problem, level, best.at, CUTOFF, 20, 1.0)
+        small = FEW_STEP if problem.free.parameters else 1.0
+        best = _descend(problem, level, best.at, CUTOFF, 20, small)
         level, at = _refined(problem, best, many, depth)
         along = _for_slopes(problem, many, depth, seed)
     else:
