@@ -10,6 +10,7 @@ from diffdisp.texture import (
     as_texture,
     covered,
     filtered_square_wave,
+    filtered_tiles,
 )
 
 RNG = np.random.default_rng(2)
@@ -149,6 +150,97 @@ def parallelograms(axes, low, high, count=60):
     middle = RNG.uniform(-4, 4, (axes, count))
     edges = np.exp(RNG.uniform(np.log(low), np.log(high), (2, axes, count)))
     return middle, *(edges * RNG.choice([-1, 1], edges.shape))
+
+
+TILES = jax.jit(jax.vmap(filtered_tiles))
+
+
+def tiles_along_lines(where, lines=2000):
+    """Mean of even minus odd over parallelograms: along lines from edge to edge, exactly."""
+    middle, across, down = (np.asarray(part) for part in where)
+    t = (np.arange(lines) + 0.5) / lines - 0.5
+    found = []
+    for m, a, d in zip(middle.T, across.T, down.T, strict=True):
+        at = m[:, None] + d[:, None] * t
+        edges = np.round(m)[:, None]  # the only ones that these may meet
+        crossings = np.clip((edges - at) / a[:, None], -0.5, 0.5)
+        ends = np.sort(np.concatenate([crossings, [0 * t - 0.5, 0 * t + 0.5]]), axis=0)
+        inside = at[:, None] + a[:, None, None] * 0.5 * (ends[1:] + ends[:-1])
+        even = np.floor(inside).sum(axis=0) % 2 == 0
+        found.append(np.sum(np.where(even, 1, -1) * np.diff(ends, axis=0), axis=0).mean())
+    return np.array(found)
+
+
+@pytest.mark.parametrize("size", [1e-3, 0.1, 0.5])
+def test_a_corner_of_four_tiles_within_a_footprint(size):
+    middle, across, down = parallelograms(2, 0.01 * size, size, 300)
+    middle = np.round(middle) + RNG.uniform(-0.5, 0.5, middle.shape) * size
+    found = TILES(tuple(middle), tuple(across), tuple(down))
+    # Midpoints across kinks, as above; slivers count as 1/1000 as broad as long.
+    expected = tiles_along_lines((middle, across, down))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-3)
+    area = across[0] * down[1] - across[1] * down[0]
+    broad = np.abs(area) > 2e-3 * np.sum(across**2 + down**2, axis=0)
+    np.testing.assert_allclose(found[broad], expected[broad], rtol=0, atol=2e-5)
+    both = [WAVE(*part) for part in zip(middle, across, down, strict=True)]
+    assert np.max(np.abs(found - both[0] * both[1])) > 0.2  # so much is in how both go together
+
+
+@pytest.mark.parametrize("size", [0.3, 2.0])
+def test_of_rectangles_along_tiles_the_mean_is_a_product(size):
+    middle, across, down = parallelograms(2, 0.1 * size, size, 300)
+    across[1], down[0] = 0, 0
+    found = TILES(tuple(middle), tuple(across), tuple(down))
+    both = [WAVE(*part) for part in zip(middle, across, down, strict=True)]
+    np.testing.assert_allclose(found, both[0] * both[1], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("width", [0.0, 1e-30, 1e-9])
+def test_a_point_shows_its_tile(width):
+    middle = RNG.uniform(-4, 4, (2, 400))
+    edge = np.full_like(middle, width)
+    expected = hard_wave(middle[0]) * hard_wave(middle[1])
+    np.testing.assert_array_equal(TILES(tuple(middle), tuple(edge), tuple(-edge)), expected)
+
+
+@pytest.mark.parametrize("size", [0.1, 0.5, 3.0])
+def test_slopes_of_tiles_are_those_of_the_mean(size):
+    where = np.concatenate(parallelograms(2, 0.1 * size, size, 300))
+    area = np.abs(where[2] * where[5] - where[3] * where[4])
+    where = where[:, area > 0.01 * size**2]
+
+    def mean(where):
+        return TILES(*(tuple(where[k : k + 2]) for k in (0, 2, 4)))
+
+    slopes = jax.vmap(jax.grad(lambda w: filtered_tiles((w[0], w[1]), (w[2], w[3]), (w[4], w[5]))))(
+        where.T
+    ).T
+    step = 1e-7
+    for axis, slope in enumerate(slopes):
+        by = step * (np.arange(6) == axis)[:, None]
+        differences = (mean(where + by) - mean(where - by)) / (2 * step)
+        # Second derivatives jump by 1/(area of the footprint) at most, times its size.
+        np.testing.assert_allclose(slope, differences, rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("along", SIZES)
+def test_slopes_of_tiles_are_finite_everywhere(along):
+    x, y, other = (grid.ravel() for grid in np.meshgrid(EDGES, EDGES, SIZES))
+    edge = np.full_like(x, along)
+    for down in ((other, edge), (edge, other), (other, 0 * x), (edge, edge)):
+        slopes = jax.vmap(jax.grad(filtered_tiles, argnums=(0, 1, 2)))((x, y), (edge, edge), down)
+        assert all(np.isfinite(slope).all() for slope in jax.tree.leaves(slopes))
+
+
+def test_float32_keeps_the_digits_of_corners():
+    where = [np.float32(w) for w in parallelograms(2, 0.02, 0.5, 4000)]
+    expected = TILES(*(tuple(w.astype(np.float64)) for w in where))
+    with jax.enable_x64(False):
+        found = TILES(*(tuple(w) for w in where))
+    assert found.dtype == np.float32
+    # Rounding over the least ratio of the areas; an 8-bit step is 4e-3.
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-3)
+    assert np.sqrt(np.mean((np.asarray(found) - np.asarray(expected)) ** 2)) < 3e-5
 
 
 def test_what_is_covered_of_a_footprint():

@@ -19,7 +19,7 @@ from diffdisp.film import Film
 from diffdisp.integrator import Lanes, Paint, lane_radiance, paint_table, world_tables
 from diffdisp.planning import Plan
 from diffdisp.programs import OPTIONS
-from diffdisp.sampling import Numbers, sample_grid
+from diffdisp.sampling import Numbers, footprints, sample_grid
 from diffdisp.scene import Scene, is_glass, object_glass
 from diffdisp.vector import Array, Real, module_of
 
@@ -89,18 +89,6 @@ def run_numbers(
         (place // columns) / rows,
         (np.asarray(1.0 / columns), np.asarray(1.0 / rows)),
     )
-
-
-def footprints(samples: int) -> int:
-    """Into how many parts a pixel is divided for its samples, some of which share each of them.
-
-    What a path sees is averaged over its part until it scatters, and drawn at random after that:
-    small parts would leave few samples to tell what is lit at an edge, and large ones are not as
-    straight. So both become better with more samples.
-    """
-    most = max(16, round(2 * samples**0.5))
-    count = max(k for k in range(1, most + 1) if samples % k == 0)
-    return count if 4 * count >= min(most, samples) else samples
 
 
 def film_size(film: Film) -> tuple[np.ndarray, np.ndarray]:

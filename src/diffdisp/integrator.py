@@ -33,9 +33,9 @@ from diffdisp.geometry import (
 )
 from diffdisp.material import Dielectric, Emitter, Lambertian, Material, Metal
 from diffdisp.planning import Plan
-from diffdisp.sampling import Numbers, uniform_direction
+from diffdisp.sampling import Numbers, footprints, uniform_direction
 from diffdisp.scene import Object, Scene, is_glass, texture_of
-from diffdisp.texture import Checker, Solid, covered, filtered_square_wave
+from diffdisp.texture import Checker, Solid, covered, filtered_square_wave, filtered_tiles
 from diffdisp.vector import (
     Array,
     Real,
@@ -77,6 +77,9 @@ class Paint(NamedTuple):
     cubes: Bool[Array, " rows"]
 
 
+Channels = tuple[Real, ...]
+
+
 class Path(NamedTuple):
     """A path, or one in each of many lanes, on its way to a surface that sends it on.
 
@@ -95,6 +98,45 @@ class Path(NamedTuple):
     alive: Array
     spectral: Array | None
     reflected: Real | None
+    choices: "Choices | None" = None
+    lit: "Lit | None" = None
+
+
+class Choices(NamedTuple):
+    """What a path has chosen before it scatters.
+
+    Args:
+        number: in [0, 1), uniform whatever has been chosen: one number serves all choices.
+        chance: of all that has been chosen.
+        code: a number for what that is.
+    """
+
+    number: Real
+    chance: Real
+    code: Int[Array, "..."]
+
+    def made(self, chance: Real) -> "tuple[Array, Choices]":
+        """Whether something is chosen by its chance, which has no derivative, and what is then."""
+        chosen = self.number < chance
+        counted = jnp.where(chosen, chance, 1.0 - chance)
+        rest = jnp.where(chosen, self.number, self.number - chance)
+        rest = rest / jnp.where(counted > 0, counted, 1.0)
+        code = self.code * 2 + jnp.where(chosen, 2, 1)
+        return chosen, Choices(rest, self.chance * counted, code)
+
+
+class Lit(NamedTuple):
+    """Where a path scattered first.
+
+    Args:
+        throughput: of the path from there on; 0 where it has not scattered.
+        before: radiance that it had by then.
+        surface: that it was; -1 where it has not.
+    """
+
+    throughput: Channels
+    before: Channels
+    surface: Int[Array, "..."]
 
 
 def surfaces_of(scene: Scene) -> list[Object]:
@@ -351,11 +393,9 @@ def pushed(of: Callable[[Any], Any], value: Any, edges: Any) -> tuple[Any, Any]:
     return result, tuple(push(edge) for edge in edges)
 
 
-Channels = tuple[Real, ...]
-
-
 def painted(
     surface: Array,
+    path: Path,
     point: Callable[[Any], Vec3],
     met: Any,
     edges: tuple[Any, Any] | None,
@@ -368,6 +408,7 @@ def painted(
 
     Args:
         surface: its number.
+        path: on its way to it.
         point: from `met` to where the ray meets the surface; a little beneath it.
         met: what tells that.
         edges: the derivatives of `met` along both edges of a footprint, if there is one.
@@ -411,7 +452,13 @@ def painted(
         place = once(row_of_both, one)
         both = (jnp.concatenate([m + h, m - h]) for m, h in zip(mean, half, strict=True))
         return tuple(_pick(channel, place) for channel in both)
-    mix = _one_of([_filtered(wave, met, edges, one) for wave in waves], is_cubes)
+    mixes = []
+    if tiled:
+        normal = _pick_vector(tables.world.normals, plane)
+        mixes.append(_filtered_tiles(on_tiles, met, edges, _bends(path, normal), one))
+    if cubed:
+        mixes.append(_filtered_cubes(waves[-1], met, edges, one))
+    mix = _one_of(mixes, is_cubes)
     return tuple(_pick(m, place) + _pick(h, place) * mix for m, h in zip(mean, half, strict=True))
 
 
@@ -426,16 +473,81 @@ def _is_odd(coordinates: tuple[Real, ...]) -> Array:
     return jnp.asarray(cells != 2.0 * jnp.floor(0.5 * cells))
 
 
-def _filtered(
+def _filtered_tiles(
+    coordinates: Callable[[Any], tuple[Real, ...]],
+    met: Any,
+    edges: tuple[Any, Any],
+    bends: tuple[Real, Real],
+    one: Array | None,
+) -> Real:
+    """The mean over a footprint of +1 on even and -1 on odd tiles: that of its two halves.
+
+    Args:
+        coordinates: from `met` to where on the tiles that is.
+        met: the footprint's middle.
+        edges: of the footprint.
+        bends: as `_bends` tells; what is divided is the edge along which that is more.
+        one: as in `once`.
+    """
+    values, reaches = once(lambda: pushed(coordinates, met, edges), one)
+    swap = jnp.abs(bends[1]) > jnp.abs(bends[0])
+    (bend, aside), (along, beside) = choose(
+        swap, (bends[::-1], reaches[::-1]), (bends, tuple(reaches))
+    )
+
+    def half(place: float) -> tuple[Any, Any, Any]:
+        """The half about a place of the edge."""
+        nearer = 1.0 / (1.0 + place * bend)
+        middle = tuple(v + a * (place * nearer) for v, a in zip(values, along, strict=True))
+        square = nearer * nearer
+        own = tuple(0.5 * square * a for a in along)
+        other = tuple(
+            square * (b + place * (bend * b - aside * a))
+            for a, b in zip(along, beside, strict=True)
+        )
+        return middle, own, other
+
+    halves = once(lambda: (half(-0.25), half(0.25)), one)
+    return 0.5 * sum(once(partial(filtered_tiles, *part), one) for part in halves)
+
+
+MOST_BENT = 2.0
+"""At twice its own cosine along an edge a footprint reaches the horizon, where all is its mean."""
+
+
+def _bends(path: Path, normal: Vec3) -> tuple[Real, Real]:
+    """By what part of itself the cosine to a plane changes along both edges of a footprint.
+
+    A plane sees rays in perspective: what is even on the film is further apart where it is farther
+    away. To first order a footprint does not know that, and near the horizon it is most of what a
+    picture of few samples has wrong.
+    """
+    assert path.footprint is not None
+    cosine = path.ray.direction.dot(normal)
+    cosine = jnp.where(cosine == 0, 1.0, cosine)
+    across, down = (edge.direction.dot(normal) / cosine for edge in path.footprint)
+    return jnp.clip(across, -MOST_BENT, MOST_BENT), jnp.clip(down, -MOST_BENT, MOST_BENT)
+
+
+def _filtered_cubes(
     coordinates: Callable[[Any], tuple[Real, ...]],
     met: Any,
     edges: tuple[Any, Any],
     one: Array | None,
 ) -> Real:
-    """The mean over a footprint of +1 in even and -1 in odd tiles."""
+    """The mean over a footprint of +1 in even and -1 in odd cubes.
+
+    That of three waves at once, by those of two at a time, as if no three went together: exact
+    where no more than two of them change within the footprint.
+    """
     values, reaches = once(lambda: pushed(coordinates, met, edges), one)
-    waves = zip(values, *reaches, strict=True)
-    return reduce(jnp.multiply, [once(partial(filtered_square_wave, *w), one) for w in waves])
+    axes = list(zip(values, *reaches, strict=True))
+    alone = once(lambda: [filtered_square_wave(*axis) for axis in axes], one)
+    mean: Real = -2.0 * alone[0] * alone[1] * alone[2]
+    for third in range(3):
+        two = [axis for number, axis in enumerate(axes) if number != third]
+        mean = mean + alone[third] * once(partial(filtered_tiles, *zip(*two, strict=True)), one)
+    return mean
 
 
 def _beneath(point: Vec3, outward: Vec3, surface: Array, tables: "Tables", plan: Plan) -> Vec3:
@@ -480,11 +592,20 @@ def emitted(
 
     if path.footprint is None:
         return painted(
-            surface, lambda ray: point((ray, reach(ray))), path.ray, None, tables, plan, True, one
+            surface,
+            path,
+            lambda ray: point((ray, reach(ray))),
+            path.ray,
+            None,
+            tables,
+            plan,
+            True,
+            one,
         )
     distance, gains = once(lambda: pushed(reach, path.ray, path.footprint), one)
     across, down = zip(path.footprint, gains, strict=True)
-    return painted(surface, point, (path.ray, distance), (across, down), tables, plan, True, one)
+    met, edges = (path.ray, distance), (across, down)
+    return painted(surface, path, point, met, edges, tables, plan, True, one)
 
 
 class Seen(NamedTuple):
@@ -706,6 +827,10 @@ def new_path(ray: Ray, footprint: tuple[Ray, Ray] | None, surface: Array, plan: 
         alive,
         jnp.zeros(zero.shape, bool) if parts else None,
         zero if parts else None,
+        None,
+        Lit((zero,) * plan.channels, (zero,) * plan.channels, no_surface(zero))
+        if plan.filtered
+        else None,
     )
 
 
@@ -979,7 +1104,12 @@ def _go_on(
     if setting.differentiable:
         kept = choose(alive, kept, path)
     return kept._replace(
-        radiance=radiance, alive=alive, spectral=moved.spectral, reflected=moved.reflected
+        radiance=radiance,
+        alive=alive,
+        spectral=moved.spectral,
+        reflected=moved.reflected,
+        choices=moved.choices,
+        lit=moved.lit,
     )
 
 
@@ -1006,6 +1136,7 @@ class Scattered(NamedTuple):
         matte: whether the surface is matte.
         spectral: whether dispersive glass has been met.
         reflected: as in `Path`.
+        choices: as in `Path`.
         share: of the light at glass that goes the chosen way, over the chance of that; None where
             no derivatives are asked for, or no glass is there.
         density: of the chosen direction, in solid angle, where matte; None, as the others, where
@@ -1023,6 +1154,7 @@ class Scattered(NamedTuple):
     matte: Array
     spectral: Array | None
     reflected: Real | None
+    choices: Choices | None
     share: Real | None
     density: Real | None = None
     lamp: Array | None = None
@@ -1046,6 +1178,7 @@ def _one_way(path: Path, setting: Setting) -> Path:
         throughput=scattered.throughput,
         spectral=scattered.spectral,
         reflected=scattered.reflected,
+        choices=scattered.choices,
     )
     radiance, counts = path.radiance, path.alive
     if setting.always is not None:
@@ -1057,13 +1190,18 @@ def _one_way(path: Path, setting: Setting) -> Path:
     spheres = all_spheres(tables.world, plan, setting.one)
     if plan.filtered and scattered.share is not None:
         radiance = _against_chance(radiance, counts, path.throughput, scattered.share, setting)
+    if path.lit is not None:
+        assert path.footprint is not None
+        first = scattered.matte & ~_all_zero(path.footprint) & path.alive
+        here = Lit(scattered.throughput, radiance, path.surface)
+        moved = moved._replace(lit=choose(first, here, path.lit))
     if footprint is None:
         surface = nearest(moved.ray, tables.world, plan, path.surface, spheres)
     else:
-        number = setting.draw(path.bounces, plan.numbers_per_bounce)
-        surface, share = _one_of_seen(moved, spheres, setting, number)
+        surface, share, choices = _one_of_seen(moved, spheres, setting)
         radiance = _against_chance(radiance, counts, moved.throughput, share, setting)
-        moved = moved._replace(throughput=tuple(t * share for t in moved.throughput))
+        throughput = tuple(t * share for t in moved.throughput)
+        moved = moved._replace(throughput=throughput, choices=choices)
     light = emitted(surface, moved, tables, plan, setting.one)
     arrives = counts & scattered.goes_on & (surface >= plan.first_lamp)
     factor = jnp.where(arrives, 1.0, 0.0)
@@ -1096,10 +1234,8 @@ def _scattered_footprint(path: Path, setting: Setting) -> tuple[Scattered, tuple
     return scattered, (across, down)
 
 
-def _one_of_seen(
-    moved: Path, spheres: Candidates, setting: Setting, number: Real
-) -> tuple[Array, Real]:
-    """One of the surfaces that a footprint meets, and what it counts.
+def _one_of_seen(moved: Path, spheres: Candidates, setting: Setting) -> tuple[Array, Real, Choices]:
+    """One of the surfaces that a footprint meets, what it counts, and the choices with this one.
 
     Across an outline, and the horizon of a plane, lie two: the nearer one is chosen by the part of
     the footprint that meets it. The part has a derivative, the chance has none. Outlines of balls
@@ -1109,7 +1245,6 @@ def _one_of_seen(
         moved: the path, with the surface that it leaves as its last.
         spheres: those that it can meet.
         setting: the rest.
-        number: in [0, 1).
     """
     plan, world, ray, footprint = setting.plan, setting.tables.world, moved.ray, moved.footprint
     assert footprint is not None
@@ -1118,11 +1253,14 @@ def _one_of_seen(
     # A small part changes by much of itself: it is chosen more often than it is large.
     certain = jax.lax.stop_gradient(part)
     chance = jnp.where(certain > 0, 0.5 * (1.0 + certain), 0.0)
-    taken = number < chance
+    assert moved.choices is not None
+    taken, made = moved.choices.made(chance)
+    choices = choose(_all_zero(footprint), moved.choices, made)
     behind = nearest(ray, world, plan, moved.last, spheres, None, first)
     share = jnp.where(taken, part, 1.0 - part)
     counted = jnp.where(taken, chance, 1.0 - chance)
-    return jnp.where(taken, first, behind), share / jnp.where(counted > 0, counted, 1.0)
+    share = share / jnp.where(counted > 0, counted, 1.0)
+    return jnp.where(taken, first, behind), share, choices
 
 
 def _against_chance(
@@ -1171,6 +1309,35 @@ def _part_met(
     return part
 
 
+def _seen_flat(path: Path, tables: Tables, plan: Plan) -> Array:
+    """Whether a footprint is seen so flat by the surface that it meets that tiles are their mean.
+
+    Where its middle passes the surface, its foot says nothing of how far the part beyond the
+    outline reaches: on a plane to infinity.
+    """
+    assert path.footprint is not None
+    ray, footprint = jax.lax.stop_gradient((path.ray, path.footprint))
+    world = tables.world
+    surface, pointed = path.surface, _all_zero(path.footprint)
+    flat: Array = jnp.zeros(surface.shape, bool)
+    if plan.first_plane > plan.balls:
+        row = jnp.clip(surface, 0, plan.first_plane - 1)
+        center, radius = _pick_vector(world.centers, row), _pick(world.radii, row)
+        _, depth, edges = sphere_depth(ray, footprint, center, radius)
+        reach = radius * jnp.sqrt(jnp.maximum(depth + 0.5 * box_width(edges), 0.0))
+        scale = _pick(tables.paint.scale, jnp.maximum(row - plan.balls, 0))
+        ball = (surface >= plan.balls) & (surface < plan.first_plane)
+        flat = ball & (depth <= 0) & (reach * scale > 0.5)
+    if plan.matte_planes + plan.metal_planes:
+        plane = _plane_row(surface, plan)
+        normal = _pick_vector(world.normals, plane)
+        height = (ray.origin - _pick_vector(world.points, plane)).dot(normal)
+        downward = ray.direction.dot(normal) * jnp.where(height < 0, 1.0, -1.0)
+        on_plane = (surface >= plan.first_plane) & (surface < plan.first_lamp)
+        flat = flat | (on_plane & (downward <= 0))
+    return flat & ~pointed
+
+
 def _starts_outside(ray: Ray, center: Vec3, radius: Real) -> Array:
     """Whether a ray starts outside a sphere, and not on it or within rounding of that."""
     offset = ray.origin - center
@@ -1204,11 +1371,12 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
             setting.one,
         )
 
-    def ways() -> tuple[Mix, Vec3 | None, Array, Channels | None, Real | None]:
+    def ways() -> tuple[Mix, Vec3 | None, Array, Channels | None, Real | None, Choices | None]:
         """How the new direction is mixed, of what, whether there is a surface, what goes there.
 
         And what a reflected path counts that is to follow this one.
         """
+        choices = path.choices
         unit, shares, zero, reflected = None, None, jnp.zeros_like(cosine), path.reflected
         mix, differ = Mix(*reflection(cos_i), zero), jnp.ones(cosine.shape, bool)
         if plan.numbers_per_bounce > 1:
@@ -1235,6 +1403,11 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
                 followed = leaves & ~spread & (chance > 0)
                 chance = jnp.where(followed, jnp.maximum(chance, STAYING), chance)
             mirrored: Array = drawn[0] < chance
+            if choices is not None:
+                chosen, made = choices.made(chance)
+                seen = is_glass & ~spread
+                mirrored = jnp.where(seen, chosen, mirrored)
+                choices = choose(seen, made, choices)
             if setting.split is not None:
                 assert reflected is not None
                 mirrored, shares, reflected = _parted(
@@ -1251,9 +1424,9 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
             through = choose(mirrored, Mix(*reflection(angle), zero), bent)
             mix = choose(is_glass, through, mix)
             differ = jnp.asarray(glass.differ | ~is_glass)
-        return mix, unit, differ, shares, reflected
+        return mix, unit, differ, shares, reflected, choices
 
-    mix, unit, differ, shares, reflected = once(ways, setting.one)
+    mix, unit, differ, shares, reflected, choices = once(ways, setting.one)
 
     def mixed() -> Vec3:
         """The new direction, of any length."""
@@ -1261,10 +1434,6 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
         return direction if unit is None else direction + unit * mix.unit
 
     raw = once(mixed, setting.one)
-
-    def beneath(ray: Ray) -> Vec3:
-        point, outward, _ = _meet(path._replace(ray=ray), setting)
-        return _beneath(point, outward, surface, setting.tables, plan)
 
     def finished() -> Scattered:
         squared = raw.dot(raw)
@@ -1276,11 +1445,12 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
         if plan.fuzzy:
             goes_on = is_matte | is_glass | (direction.dot(facing) > 0)
         sunk = _beneath(point, outward, surface, setting.tables, plan)
-        where: tuple[Callable[[Any], Vec3], Any] = (lambda at: at), sunk
-        if path.footprint is not None:
-            where = beneath, path.ray
-        edges, one = path.footprint, setting.one
-        albedo = painted(surface, *where, edges, setting.tables, plan, False, one)
+        if path.footprint is None:
+            albedo = painted(
+                surface, path, lambda at: at, sunk, None, setting.tables, plan, False, setting.one
+            )
+        else:
+            albedo = _mean_albedo(path, setting)
         throughput = tuple(
             t * jnp.where(is_glass, 1.0, a) for t, a in zip(path.throughput, albedo, strict=True)
         )
@@ -1299,7 +1469,9 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
                     for t, w in zip(throughput, setting.weights, strict=True)
                 )
         ray, share = Ray(point, direction), shares[0] if setting.differentiable and shares else None
-        return Scattered(ray, throughput, goes_on, differ, is_matte, spectral, reflected, share)
+        return Scattered(
+            ray, throughput, goes_on, differ, is_matte, spectral, reflected, choices, share
+        )
 
     scattered = once(finished, setting.one)
     return (
@@ -1307,6 +1479,38 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
         if plan.lit
         else scattered
     )
+
+
+PARTS = 4
+"""Along each edge of a footprint: so many points of what scatters are met exactly. Far away, and at
+an outline, a footprint is far from straight there. Measured on two balls over matte grounds: 0.055
+and 0.086 off, with 2 parts 0.061 and 0.089; and before there were parts, with more noise, 0.13 and
+0.16."""
+
+
+def _mean_albedo(path: Path, setting: Setting) -> Channels:
+    """What part of the light a surface that scatters sends on, its mean over a footprint."""
+    assert path.footprint is not None
+    plan, tables, surface = setting.plan, setting.tables, path.surface
+    row = jnp.maximum(surface - plan.balls, 0) + tables.first_row
+    footprint = path.footprint
+    small = jax.tree.map(lambda edge: edge * (1.0 / PARTS), footprint)
+    middles = ((np.arange(PARTS) + 0.5) / PARTS - 0.5).astype(plan.dtype)
+
+    def beneath(ray: Ray) -> Vec3:
+        point, outward, _ = _meet(path._replace(ray=ray), setting)
+        return _beneath(point, outward, surface, tables, plan)
+
+    def part(x: Real, y: Real) -> Channels:
+        ray = jax.tree.map(lambda r, a, d: r + x * a + y * d, path.ray, *footprint)
+        seen = path._replace(ray=ray, footprint=small)
+        shown = painted(surface, seen, beneath, ray, small, tables, plan, False, setting.one)
+        flat = _seen_flat(seen, tables, plan)
+        means = (_pick(mean, row) for mean in tables.paint.mean)
+        return tuple(jnp.where(flat, m, a) for m, a in zip(means, shown, strict=True))
+
+    across, down = (grid.ravel() for grid in np.meshgrid(middles, middles))
+    return tuple(jnp.mean(channel, axis=0) for channel in jax.vmap(part)(across, down))
 
 
 STAYING = 0.4
@@ -1719,8 +1923,7 @@ def _to_the_end(
     loop: Loop,
 ) -> Float[Array, "wavelengths samples pixels channels"]:
     """The radiance of the paths (J, S, P), followed to their ends."""
-    per_bounce = plan.numbers_per_bounce + int(plan.filtered)
-    numbers = Numbers(per_bounce, lanes.seed, plan.dtype)
+    numbers = Numbers(plan.numbers_per_bounce, lanes.seed, plan.dtype)
     starts = numbers.start(lanes.pixel)
     waves, samples, pixels = paths.alive.shape
     rows = tables.paint.mean[0].shape[0] // waves
@@ -1760,13 +1963,78 @@ def _to_the_end(
     def every_path(inside: bool | None) -> Step:
         return jax.vmap(partial(advance, inside=inside))
 
+    if plan.filtered:
+        paths = paths._replace(choices=_first_choices(paths, numbers, starts, lanes))
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1), paths)
     if plan.scattering or plan.balls > 1 or plan.nested:
         ended = loop(None, every_path(None), flat, plan)
     else:
         # One ball apart from all else is entered once; after that its paths stay inside.
         ended = loop(every_path(False), every_path(True), flat, plan)
-    return jnp.stack(ended.radiance, axis=-1).reshape(waves, samples, pixels, -1)
+    radiance = jnp.stack(ended.radiance, axis=-1).reshape(waves, samples, pixels, -1)
+    if ended.lit is None:
+        return radiance
+    grid = (waves, samples, pixels)
+    lit, choices = jax.tree.map(lambda leaf: leaf.reshape(grid), (ended.lit, ended.choices))
+    return _lit_alike(radiance, lit, choices)
+
+
+def _first_choices(paths: Path, numbers: Numbers, starts: Array, lanes: Lanes) -> Choices:
+    """Of paths (J, S, P): numbers that are even over the samples of each part of a pixel."""
+    together = lanes.sample.shape[0] // footprints(lanes.sample.shape[0])
+    part, within = lanes.sample // together, lanes.sample % together
+    by_pixel = jax.vmap(numbers.of_film, (0, None, None))
+    shift = jax.vmap(by_pixel, (None, 0, None))(starts, part, 2)
+    number = (within.astype(shift.dtype)[:, None] + shift) * (1.0 / together)
+    number = jnp.broadcast_to(number, paths.alive.shape)
+    return Choices(number, jnp.ones_like(number), jnp.zeros(number.shape, jnp.int32))
+
+
+def _lit_alike(radiance: Array, lit: Lit, choices: Choices) -> Array:
+    """The same radiance, with derivatives of less noise.
+
+    A path's derivative is that of what it counts times what it is lit by where it scatters first,
+    and that of the latter. All paths of a part of a pixel that have chosen alike see one point of
+    a texture by one footprint: of the first term they need not be as many as chance made them, nor
+    lit as each of them is by chance. It is taken as if they were as many as their chance says, and
+    each lit as they are in the mean.
+
+    Args:
+        radiance: (J, S, P, channels) of the paths.
+        lit: of the paths, (J, S, P).
+        choices: of the paths, (J, S, P).
+    """
+    waves, samples, pixels, channels = radiance.shape
+    together = samples // footprints(samples)
+
+    def parts(values: Array) -> Array:
+        return values.reshape(waves, -1, together, pixels)
+
+    chosen = lit.surface >= 0
+    alike = parts(chosen)[:, :, None] & parts(chosen)[:, :, :, None]
+    for of in (choices.code, lit.surface):
+        alike = alike & (parts(of)[:, :, None] == parts(of)[:, :, :, None])
+    pairs = alike.astype(radiance.dtype)
+
+    def total(values: Array) -> Array:
+        """Over the paths that have chosen alike."""
+        sums = jnp.einsum("jbstp,jbtp->jbsp", pairs, parts(values))
+        return sums.reshape(waves, samples, pixels)
+
+    # As many as chance says, and not fewer than one: where there is none, none stands for it.
+    expected = jnp.maximum(choices.chance * together, 1.0)
+    ratio = expected / jnp.maximum(total(chosen.astype(radiance.dtype)), 1.0)
+    shown = []
+    for channel in range(channels):
+        whole, through = radiance[..., channel], lit.throughput[channel]
+        after, still = jax.lax.stop_gradient((whole - lit.before[channel], through))
+        some = chosen & (still != 0)
+        divisor = jnp.where(some, still, 1.0)
+        light = jnp.where(some, after / divisor, 0.0)
+        mean = total(light) / jnp.maximum(total(some.astype(light.dtype)), 1.0)
+        change = jnp.where(some, through / divisor - 1.0, 0.0)
+        shown.append(whole + change * jax.lax.stop_gradient(mean * ratio * still - after))
+    return jnp.stack(shown, axis=-1)
 
 
 BLOCK = 512
@@ -1800,8 +2068,8 @@ def _until_done(enter: Step | None, advance: Step, paths: Path, plan: Plan) -> P
             lane = jnp.where(there, lane, total)
             path = path._replace(alive=path.alive & there)
             path = step(lane, path, count)
-            pairs = zip(results, path.radiance, strict=True)
-            results = tuple(whole.at[lane].set(part) for whole, part in pairs)
+            kept_of = path.radiance, path.lit, path.choices
+            results = jax.tree.map(lambda whole, part: whole.at[lane].set(part), results, kept_of)
             order = first_places(path.alive)
             lanes = jax.tree.map(
                 lambda whole, part: jax.lax.dynamic_update_slice_in_dim(
@@ -1832,12 +2100,16 @@ def _until_done(enter: Step | None, advance: Step, paths: Path, plan: Plan) -> P
 
     paths = jax.tree.map(padded, paths)
     numbers = jnp.arange(total + spare, dtype=jnp.int32)
-    results = tuple(jnp.zeros(total + 1, plan.dtype) for _ in range(plan.channels))
+    results = jax.tree.map(
+        lambda leaf: jnp.zeros(total + 1, leaf.dtype),
+        (paths.radiance, paths.lit, paths.choices),
+    )
     state = (numbers, paths), jnp.asarray(total, jnp.int32), results
     if enter is not None:
         state = sweep(once_in, state)
     state = jax.lax.while_loop(lambda state: state[1] > 0, partial(sweep, thinned), state)
-    return paths._replace(radiance=tuple(channel[:total] for channel in state[2]))
+    radiance, lit, choices = jax.tree.map(lambda leaf: leaf[:total], state[2])
+    return paths._replace(radiance=radiance, lit=lit, choices=choices)
 
 
 def first_places(chosen: Bool[Array, " places"]) -> Int[Array, " places"]:

@@ -20,6 +20,19 @@ def sample_grid(samples: int) -> tuple[int, int]:
     return samples // rows, rows
 
 
+def footprints(samples: int) -> int:
+    """Into how many parts a pixel is divided for its samples, some of which share each of them.
+
+    What a path sees is averaged over its part until it scatters, and drawn at random after that:
+    small parts would leave few samples to follow all that light does there, and large ones are not
+    as straight. So both become better with more samples. Measured with 256 on two balls over matte
+    grounds, 16, 32 and 64 parts: 0.055, 0.057, 0.069 off, and 0.086, 0.096, 0.122.
+    """
+    most = max(16, round(samples**0.5))
+    count = max(k for k in range(1, most + 1) if samples % k == 0)
+    return count if 4 * count >= min(most, samples) else samples
+
+
 def mixed(word: Array) -> Array:
     """A 32-bit word with its bits thoroughly mixed.
 

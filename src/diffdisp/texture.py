@@ -6,7 +6,9 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from diffdisp.dispersion import real_array
-from diffdisp.vector import Real, Triple
+from diffdisp.vector import Real, Triple, choose
+
+Pair = tuple[Real, Real]
 
 
 class Solid(eqx.Module):
@@ -71,6 +73,77 @@ def filtered_square_wave(x: Real, across: Real, down: Real) -> Real:
     return jnp.where(
         0.5 * (wide + narrow) <= 0.5, _near_edge(x, wide, narrow), _many_edges(x, wide, narrow)
     )
+
+
+def filtered_tiles(middle: Pair, across: Pair, down: Pair) -> Real:
+    """Mean over a parallelogram of the product of two square waves: +1 on even tiles, -1 on odd.
+
+    The product of both means, which is that of a rectangle along the tiles; but where no more than
+    one edge each way is met, exact, with the corner of four tiles that may lie within.
+
+    Args:
+        middle: of the footprint, in tiles along both axes.
+        across: the footprint's one edge, in tiles.
+        down: its other edge.
+
+    Returns:
+        The mean, within [-1, 1].
+    """
+    waves = [filtered_square_wave(*wave) for wave in zip(middle, across, down, strict=True)]
+    reaches = [jnp.abs(a) + jnp.abs(b) for a, b in zip(across, down, strict=True)]
+    met = _around_corner(middle, across, down)
+    return jnp.where((reaches[0] <= 1.0) & (reaches[1] <= 1.0), met, waves[0] * waves[1])
+
+
+def _around_corner(middle: Pair, across: Pair, down: Pair) -> Real:
+    """The mean of the product of both signs about the nearest corner of four tiles.
+
+    By Green's theorem: the product is constant along rays from the corner, so the integral of it
+    over the parallelogram is half of that of it times (x dy - y dx) along the border, and
+    x dy - y dx is constant on each edge.
+    """
+    corner = [jnp.round(x) for x in middle]
+    cells = corner[0] + corner[1]
+    even = 1.0 - 2.0 * jnp.abs(cells - 2.0 * jnp.round(0.5 * cells))
+    at = (middle[0] - corner[0], middle[1] - corner[1])
+    swap = _dot(down, down) > _dot(across, across)
+    long, short = choose(swap, (down, across), (across, down))
+    square, area = _dot(long, long), _cross(long, short)
+    point = square <= 0
+    size = jnp.where(point, 1.0, square)
+    wider = jnp.maximum(SLIVER - jnp.abs(area) / size, 0.0) * jnp.where(area < 0, -1.0, 1.0)
+    short = (short[0] - wider * long[1], short[1] + wider * long[0])
+    area = jnp.where(point, 1.0, area + wider * square)
+    mean, tilt = 0.0 * at[0], 0.0 * at[0]
+    for edge, other in ((long, short), (short, long)):
+        first, second = (
+            _product_along((at[0] + sign * other[0], at[1] + sign * other[1]), edge)
+            for sign in (-0.5, 0.5)
+        )
+        mean = mean + 0.25 * (first + second)
+        turn = -1.0 if edge is short else 1.0
+        tilt = tilt + turn * _cross(at, edge) * (first - second)
+    return even * (mean + 0.5 * tilt / area)
+
+
+def _product_along(middle: Pair, edge: Pair) -> Real:
+    """Mean of the product of both coordinates' signs along a line of some middle and extent."""
+    signs, places = [], []
+    for x, extent in zip(middle, edge, strict=True):
+        crosses = jnp.abs(x) < 0.5 * jnp.abs(extent)
+        start = jnp.where(crosses, -extent, x)
+        signs.append(jnp.where(start < 0, -1.0, 1.0))
+        # What does not change its sign might as well do so at the very end.
+        places.append(jnp.where(crosses, -x / jnp.where(crosses, extent, 1.0), 0.5))
+    return signs[0] * signs[1] * (1.0 - 2.0 * jnp.abs(places[0] - places[1]))
+
+
+def _dot(a: Pair, b: Pair) -> Real:
+    return a[0] * b[0] + a[1] * b[1]
+
+
+def _cross(a: Pair, b: Pair) -> Real:
+    return a[0] * b[1] - a[1] * b[0]
 
 
 SLIVER = 1e-3
