@@ -85,7 +85,10 @@ class Path(NamedTuple):
 
     `footprint` and `spectral` are None where nothing is integrated over the one, and where no
     weight waits for the first dispersive glass. So is `reflected`: what the path counts that is
-    reflected where both ways are taken, 0 if none is followed.
+    reflected where both ways are taken, 0 if none is followed. `choices` and `lit` are of paths
+    that scatter and are differentiated. `stretch` is by what part of itself a step of the film
+    turns the camera's ray less from one end of each edge of the footprint to the other; where
+    there are tiles.
     """
 
     ray: Ray
@@ -100,6 +103,7 @@ class Path(NamedTuple):
     reflected: Real | None
     choices: "Choices | None" = None
     lit: "Lit | None" = None
+    stretch: tuple[Real, Real] | None = None
 
 
 class Choices(NamedTuple):
@@ -525,7 +529,9 @@ def _bends(path: Path, normal: Vec3) -> tuple[Real, Real]:
     assert path.footprint is not None
     cosine = path.ray.direction.dot(normal)
     cosine = jnp.where(cosine == 0, 1.0, cosine)
-    across, down = (edge.direction.dot(normal) / cosine for edge in path.footprint)
+    assert path.stretch is not None
+    edges = zip(path.footprint, path.stretch, strict=True)
+    across, down = (edge.direction.dot(normal) / cosine + by for edge, by in edges)
     return jnp.clip(across, -MOST_BENT, MOST_BENT), jnp.clip(down, -MOST_BENT, MOST_BENT)
 
 
@@ -801,6 +807,11 @@ def start_path(
     spheres = all_spheres(tables.world, plan, None)
     surface = nearest(ray, tables.world, plan, no_surface(zero), spheres, footprint)
     path = new_path(ray, footprint, surface, plan)
+    if footprint is not None and any(plan.tiled):
+        # Off the middle of the picture a step of the film turns a ray the less.
+        ahead = ray.direction.dot(projection.forward)
+        turns = tuple(-edge.direction.dot(projection.forward) / ahead for edge in footprint)
+        path = path._replace(stretch=(turns[0], turns[1]))
     shown = arriving(surface, path, tables, plan, one)
     ends = surface >= plan.first_lamp
     return path._replace(radiance=tuple(jnp.where(ends, channel, 0.0) for channel in shown))
@@ -1504,6 +1515,9 @@ def _mean_albedo(path: Path, setting: Setting) -> Channels:
     def part(x: Real, y: Real) -> Channels:
         ray = jax.tree.map(lambda r, a, d: r + x * a + y * d, path.ray, *footprint)
         seen = path._replace(ray=ray, footprint=small)
+        if path.stretch is not None:
+            first, second = path.stretch
+            seen = seen._replace(stretch=(first * (1.0 / PARTS), second * (1.0 / PARTS)))
         shown = painted(surface, seen, beneath, ray, small, tables, plan, False, setting.one)
         flat = _seen_flat(seen, tables, plan)
         means = (_pick(mean, row) for mean in tables.paint.mean)
