@@ -152,18 +152,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     add = parser.add_argument
     add("--repeats", type=int, default=200, help="fits of each case")
-    add("--moved-repeats", type=int, default=200, help="of that whose ball is looked for")
     add("--size", type=int, default=48, help="pixels along each edge")
     add("--bands", type=int, default=8, help="equal ones from 400 to 700 nm")
     add("--only", nargs="+", choices=[case.name for case in CASES], help="of the cases")
     options = parser.parse_args()
     film = Film(options.size, options.size, band_middles(400.0, 700.0, options.bands))
-    run = [case for case in CASES if not options.only or case.name in options.only]
     # Hours of work: what is done is kept, whatever becomes of the rest, and until it is done anew.
     rows: list[dict[str, Any]] = recorded("calibration")["scores"]
-    for case in run:
-        moved = "ball.center" in case.free
-        found = calibrate(case, film, options.moved_repeats if moved else options.repeats)
+    for case in CASES:
+        if options.only and case.name not in options.only:
+            continue
+        found = calibrate(case, film, options.repeats)
+        if not found:  # stopped before its first fit
+            continue
         print_table(list(found[0]), [list(row.values()) for row in found])
         rows = [row for row in rows if row["case"] != case.name] + found
         write_record("calibration", vars(options) | {"noise": NOISE}, {"scores": rows})

@@ -1782,7 +1782,7 @@ def once(stage: Callable[[], Any], one: Array | None = None) -> Any:
     Args:
         stage: what to compute.
         one: the number 1, as an array that the compiler does not know: for a branch. None for a
-            barrier, which has all derivatives.
+            barrier.
     """
     if one is None:
         return jax.lax.optimization_barrier(stage())  # type: ignore[no-untyped-call]
@@ -1871,7 +1871,7 @@ def _lane_radiance_jvp(
     if not all(isinstance(t, SymbolicZero) for t in jax.tree.leaves(tangents[1], is_leaf=_zero)):
         changes = jax.tree.map(_instantiate, tangents[1], lanes, is_leaf=_zero)
         radiance, slope = jax.jvp(
-            lambda lanes: _radiance(plan, indices, lanes._replace(one=None), _bounded),
+            lambda lanes: _radiance(plan, indices, lanes, _bounded),
             (lanes,),
             (changes,),
         )
