@@ -130,17 +130,23 @@ class Choices(NamedTuple):
 
 
 class Lit(NamedTuple):
-    """Where a path scattered first.
+    """Where a path scattered first, and how it came there.
 
     Args:
         throughput: of the path from there on; 0 where it has not scattered.
         before: radiance that it had by then.
         surface: that it was; -1 where it has not.
+        ray: that met it, or the camera's where it has not.
+        footprint: of that ray.
+        last: number of the surface that it came from.
     """
 
     throughput: Channels
     before: Channels
     surface: Int[Array, "..."]
+    ray: Ray
+    footprint: tuple[Ray, Ray]
+    last: Int[Array, "..."]
 
 
 def surfaces_of(scene: Scene) -> list[Object]:
@@ -839,10 +845,16 @@ def new_path(ray: Ray, footprint: tuple[Ray, Ray] | None, surface: Array, plan: 
         jnp.zeros(zero.shape, bool) if parts else None,
         zero if parts else None,
         None,
-        Lit((zero,) * plan.channels, (zero,) * plan.channels, no_surface(zero))
-        if plan.filtered
-        else None,
+        _unlit(ray, footprint, plan) if plan.filtered else None,
     )
+
+
+def _unlit(ray: Ray, footprint: tuple[Ray, Ray] | None, plan: Plan) -> Lit:
+    """Of a path that has scattered nowhere."""
+    assert footprint is not None
+    none = (jnp.zeros_like(ray.direction.x),) * plan.channels
+    nowhere = no_surface(ray.direction.x)
+    return Lit(none, none, nowhere, ray, footprint, nowhere)
 
 
 Index = Callable[[Array | int], Real]
@@ -1204,7 +1216,9 @@ def _one_way(path: Path, setting: Setting) -> Path:
     if path.lit is not None:
         assert path.footprint is not None
         first = scattered.matte & ~_all_zero(path.footprint) & path.alive
-        here = Lit(scattered.throughput, radiance, path.surface)
+        here = Lit(
+            scattered.throughput, radiance, path.surface, path.ray, path.footprint, path.last
+        )
         moved = moved._replace(lit=choose(first, here, path.lit))
     if footprint is None:
         surface = nearest(moved.ray, tables.world, plan, path.surface, spheres)
@@ -1456,12 +1470,11 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
         if plan.fuzzy:
             goes_on = is_matte | is_glass | (direction.dot(facing) > 0)
         sunk = _beneath(point, outward, surface, setting.tables, plan)
-        if path.footprint is None:
-            albedo = painted(
-                surface, path, lambda at: at, sunk, None, setting.tables, plan, False, setting.one
-            )
-        else:
-            albedo = _mean_albedo(path, setting)
+        albedo = painted(
+            surface, path, lambda at: at, sunk, None, setting.tables, plan, False, setting.one
+        )
+        if path.footprint is not None:
+            albedo = _albedo_for_now(path, is_matte, albedo, setting)
         throughput = tuple(
             t * jnp.where(is_glass, 1.0, a) for t, a in zip(path.throughput, albedo, strict=True)
         )
@@ -1499,32 +1512,84 @@ and 0.086 off, with 2 parts 0.061 and 0.089; and before there were parts, with m
 0.16."""
 
 
-def _mean_albedo(path: Path, setting: Setting) -> Channels:
-    """What part of the light a surface that scatters sends on, its mean over a footprint."""
+def _albedo_for_now(path: Path, is_matte: Array, at_point: Channels, setting: Setting) -> Channels:
+    """What part of the light a surface sends on, to a path with a footprint.
+
+    Where one scatters first it is the texture's mean, until the path has ended: then once for all
+    by `_mean_albedo`, which takes as long as several bounces.
+
+    Args:
+        path: the path.
+        is_matte: whether the surface is.
+        at_point: what it is to a path without footprint.
+        setting: the rest.
+    """
     assert path.footprint is not None
-    plan, tables, surface = setting.plan, setting.tables, path.surface
+    plan, tables = setting.plan, setting.tables
+    pointed, albedo = _all_zero(path.footprint), at_point
+    if plan.metals:
+        albedo = choose(pointed, at_point, _painted_at(path, setting))
+    return choose(is_matte & ~pointed, _mean_color(path.surface, tables, plan), albedo)
+
+
+def _mean_color(surface: Array, tables: Tables, plan: Plan) -> Channels:
+    """The mean of a texture, of a surface that is no glass."""
     row = jnp.maximum(surface - plan.balls, 0) + tables.first_row
-    footprint = path.footprint
-    small = jax.tree.map(lambda edge: edge * (1.0 / PARTS), footprint)
-    middles = ((np.arange(PARTS) + 0.5) / PARTS - 0.5).astype(plan.dtype)
+    return tuple(_pick(mean, row) for mean in tables.paint.mean)
+
+
+def _painted_at(path: Path, setting: Setting) -> Channels:
+    """The mean of a texture over the path's footprint."""
+    plan, tables, surface = setting.plan, setting.tables, path.surface
 
     def beneath(ray: Ray) -> Vec3:
         point, outward, _ = _meet(path._replace(ray=ray), setting)
         return _beneath(point, outward, surface, tables, plan)
 
+    met, edges = path.ray, path.footprint
+    return painted(surface, path, beneath, met, edges, tables, plan, False, setting.one)
+
+
+def _mean_albedo(path: Path, setting: Setting) -> Channels:
+    """What part of the light a surface that scatters sends on, its mean over a footprint."""
+    assert path.footprint is not None
+    footprint = path.footprint
+    small = path._replace(footprint=jax.tree.map(lambda edge: edge * (1.0 / PARTS), footprint))
+    if path.stretch is not None:
+        first, second = path.stretch
+        small = small._replace(stretch=(first * (1.0 / PARTS), second * (1.0 / PARTS)))
+    means = _mean_color(path.surface, setting.tables, setting.plan)
+    middles = ((np.arange(PARTS) + 0.5) / PARTS - 0.5).astype(setting.plan.dtype)
+
     def part(x: Real, y: Real) -> Channels:
         ray = jax.tree.map(lambda r, a, d: r + x * a + y * d, path.ray, *footprint)
-        seen = path._replace(ray=ray, footprint=small)
-        if path.stretch is not None:
-            first, second = path.stretch
-            seen = seen._replace(stretch=(first * (1.0 / PARTS), second * (1.0 / PARTS)))
-        shown = painted(surface, seen, beneath, ray, small, tables, plan, False, setting.one)
-        flat = _seen_flat(seen, tables, plan)
-        means = (_pick(mean, row) for mean in tables.paint.mean)
-        return tuple(jnp.where(flat, m, a) for m, a in zip(means, shown, strict=True))
+        seen = small._replace(ray=ray)
+        flat = _seen_flat(seen, setting.tables, setting.plan)
+        return choose(flat, means, _painted_at(seen, setting))
 
     across, down = (grid.ravel() for grid in np.meshgrid(middles, middles))
     return tuple(jnp.mean(channel, axis=0) for channel in jax.vmap(part)(across, down))
+
+
+def _shown(path: Path, setting: Setting) -> Path:
+    """A path that has ended, with what it counts where it scattered first.
+
+    What it brought from there has been weighed by the texture's mean.
+    """
+    lit, plan = path.lit, setting.plan
+    assert lit is not None
+    surface = jnp.maximum(lit.surface, plan.balls)
+    there = path._replace(ray=lit.ray, footprint=lit.footprint, surface=surface, last=lit.last)
+    means = _mean_color(surface, setting.tables, plan)
+    radiance, throughput = [], []
+    for channel, (mean, albedo) in enumerate(zip(means, _mean_albedo(there, setting), strict=True)):
+        some = (lit.surface >= 0) & (mean != 0)
+        ratio = jnp.where(some, albedo / jnp.where(some, mean, 1.0), 1.0)
+        before = lit.before[channel]
+        after = jnp.where(some, path.radiance[channel] - before, 0.0)
+        radiance.append(path.radiance[channel] + after * (ratio - 1.0))
+        throughput.append(lit.throughput[channel] * ratio)
+    return path._replace(radiance=tuple(radiance), lit=lit._replace(throughput=tuple(throughput)))
 
 
 STAYING = 0.4
@@ -1946,7 +2011,7 @@ def _to_the_end(
     if lanes.weights is not None:
         weights = tuple(jnp.moveaxis(lanes.weights * samples, -1, 0))
 
-    def advance(lane: Array, path: Path, inside: bool | None) -> Path:
+    def setting_of(lane: Array) -> Setting:
         wave, sample, pixel = lane // (samples * pixels), lane // pixels % samples, lane % pixels
 
         def draw(bounces: Array, decision: int) -> Real:
@@ -1960,7 +2025,7 @@ def _to_the_end(
         counts = None
         if weights is not None and plan.scattering:
             counts = tuple(look_up(channel, wave, sample) for channel in weights)
-        setting = Setting(
+        return Setting(
             tables._replace(first_row=wave * rows),
             plan,
             draw,
@@ -1972,7 +2037,9 @@ def _to_the_end(
             lanes.one,
             differentiable=True,
         )
-        return bounce(path, setting, inside)
+
+    def advance(lane: Array, path: Path, inside: bool | None) -> Path:
+        return bounce(path, setting_of(lane), inside)
 
     def every_path(inside: bool | None) -> Step:
         return jax.vmap(partial(advance, inside=inside))
@@ -1985,6 +2052,9 @@ def _to_the_end(
     else:
         # One ball apart from all else is entered once; after that its paths stay inside.
         ended = loop(every_path(False), every_path(True), flat, plan)
+    if plan.filtered:
+        lanes_of = np.arange(waves * samples * pixels, dtype=np.int32)
+        ended = jax.vmap(lambda lane, path: _shown(path, setting_of(lane)))(lanes_of, ended)
     radiance = jnp.stack(ended.radiance, axis=-1).reshape(waves, samples, pixels, -1)
     if ended.lit is None:
         return radiance
