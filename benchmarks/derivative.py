@@ -373,7 +373,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--size", type=int, default=96, help="pixels of an edge, even")
     parser.add_argument("--samples", type=int, nargs="+", default=[16, 64], help="per pixel")
-    parser.add_argument("--grids", type=int, nargs="+", default=[48, 160], help="√points of a pixel")
+    parser.add_argument(
+        "--grids", type=int, nargs="+", default=[48, 160], help="√points of a pixel"
+    )
     parser.add_argument("--steps", type=float, nargs="+", default=[1e-3, 5e-4], help="in n, hard")
     parser.add_argument("--h", type=float, default=1e-6, help="step in n of the render")
     parser.add_argument("--scattered", type=int, nargs="+", default=[256, 1024], help="samples")
