@@ -1728,7 +1728,9 @@ def _search(problem: Problem, target: Picture) -> "tuple[Level, Descent]":
         level, at = _level(problem, LAST, 1, target.samples, depth, seed), best.at
     best = _descend(problem, level, at, CUTOFF, 30, LINEAR_STEP, along)
     if problem.free.parameters and best.converged:
-        polished = _descend(problem, level, best.at, CUTOFF, POLISH, SMALL_STEP, along)
+        # The index may be told much less well than what it is mixed up with: slopes that are a few
+        # per cent rough then move it by as much as the noise does.
+        polished = _descend(problem, level, best.at, CUTOFF, POLISH, SMALL_STEP)
         best = polished._replace(steps=best.steps + polished.steps, converged=True)
     if level.robust is not None:
         level = level._replace(robust=Robust("tukey", best.spread))
