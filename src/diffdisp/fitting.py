@@ -1388,7 +1388,7 @@ def _refined(problem: Problem, few: Descent, level: Level, depth: int) -> tuple[
 
 
 def _for_slopes(problem: Problem, many: Level, depth: int, seed: int) -> Level:
-    """The whole picture from which the last level takes its slopes.
+    """The whole picture from which the last level takes its slopes, but for those of last steps.
 
     Few samples tell the slopes, and many what is left: at its end a fit has to know this to a part
     of the noise, and those to a part of themselves.
