@@ -36,7 +36,7 @@ from diffdisp import (
 
 NOISE = 0.01
 """Of the radiance; the brightest tiles have 1."""
-TRUE_SAMPLES = 1024
+TRUE_SAMPLES = 4096
 """Of the pictures before noise."""
 TRUE = {"center": (0.013, -0.021, 0.03), "radius": 1.012, "gain": 1.1, "black": 0.02}
 """Of the ball and the exposure where they are free; fits start at 0, 1, 1 and 0."""

@@ -14,6 +14,7 @@ from diffdisp.dispersion import Sellmeier, domain_error
 from diffdisp.film import Film, band_middles
 from diffdisp.fitting import (
     COLOR_WAVELENGTHS,
+    PROFILE,
     Coefficients,
     FitResult,
     StopFit,
@@ -21,6 +22,7 @@ from diffdisp.fitting import (
     _counted,
     _covariance,
     _in_order,
+    _mean_place,
     _probabilities,
     expected_uncertainty,
     fit,
@@ -288,7 +290,7 @@ def test_a_picture_of_another_renderer():
     assert abs(result.n_d - float(truth.n_d)) <= 3 * result.n_d_std
     assert abs(result.V_d - float(truth.V_d)) <= 3 * result.V_d_std
     assert result.nearest_glasses[0][0] == "N-BK7"
-    assert result.samples == (16, 16, 256)  # the file does not say its own
+    assert result.samples == (16, 256)  # the file does not say its own
 
 
 # --- colour
@@ -600,7 +602,7 @@ def test_a_mask_goes_with_a_picture_that_does_not_say_how_it_was_drawn():
     free = ("ball.center", "ball.radius")
     result = fit(bench(SILICA), noisy, free=free, noise=NOISE, mask=mask)
     assert result.converged, result.message
-    assert result.samples == (16, 16, 64, 64, 1024)
+    assert result.samples == (16, 64, 256, 1024, 4096)
     # As without a mask, in `test_place_and_size_from_a_picture_...`.
     assert abs(result.n_d - float(BK7.n_d)) < 4 * result.n_d_std < 0.025
 
@@ -674,7 +676,7 @@ def test_place_and_size_from_a_picture_that_does_not_say_how_it_was_drawn():
     noisy = with_noise(Picture(np.asarray(clean), film.wavelengths), 11)
     result = fit(bench(SILICA), noisy, free=("ball.center", "ball.radius"), noise=NOISE)
     assert result.converged, result.message
-    assert result.samples == (16, 16, 64, 64, 1024)
+    assert result.samples == (16, 64, 256, 1024, 4096)
     # As above.
     for name, value, std in result.free:
         assert abs(value - FREE_TRUTH[name]) < 4 * std, (name, value, std)
@@ -689,6 +691,23 @@ def test_place_and_size_from_a_picture_that_does_not_say_how_it_was_drawn():
     # Of z and the radius too. The fit's errors are from one residual: 9 % measured, 2 % elsewhere.
     np.testing.assert_allclose(*zip(*both, strict=True), rtol=0.15)
     assert "too small" not in expected.summary
+
+
+@pytest.mark.parametrize("middle", [0.0, 0.4, -1.1])
+@pytest.mark.parametrize("width", [0.8, 1.0, 1.15])
+def test_a_parabola_of_squares_gives_back_its_middle_and_width(middle, width):
+    mean, spread = _mean_place(((PROFILE - middle) / width) ** 2)
+    # Places end at 3, where a width of 1.15 about -1.1 has lost its last 5 %.
+    assert abs(mean - middle) < 0.11 * width
+    assert abs(spread / width - 1) < 0.11
+
+
+def test_a_second_minimum_beside_the_first_widens_and_draws():
+    squares = PROFILE**2
+    squares[-2] = 0.5  # a ripple at 2
+    mean, spread = _mean_place(squares)
+    assert 0.4 < mean < 1
+    assert 1.1 < spread < 1.3
 
 
 def test_a_colour_picture_of_another_exposure(color):

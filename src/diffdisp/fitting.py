@@ -66,24 +66,27 @@ COARSE_PIXELS = 32
 FEW_SAMPLES = 4
 """Film samples per pixel on the way to the last level."""
 
-SPLITS = (2, 4, 16)
+SPLITS = (2, 4, 8, 16, 32)
 """Into how many parts each way the last level splits a pixel, where the target does not say its own
 samples: most pixels, those that more samples change most, and where numbers of the scene are free,
-those around an outline. With `FEW_SAMPLES` in each part that is 16, 64 and 1024 samples a pixel, by
-one program."""
+those of them that change most with each of the next. With `FEW_SAMPLES` in each part that is 16
+samples a pixel to 4096, by one program."""
 
-OF_GLASS_ALONE = 8
-"""The second of these where no number of the scene is free: 256 samples. With 64, n of the bench in
+OF_GLASS_ALONE = (2, 8)
+"""The same where no number of the scene is free: 16 and 256 samples. With 64, n of the bench in
 48² pixels and 8 bands is off by half of what a noise of 1 % makes uncertain, with 256 by a
 twentieth."""
 
-REFINED = (0.5, 0.35)
-"""Parts of the pixels that show the ball that get the more samples, and the most of them."""
+FOR_SLOPES = 8
+"""The last of these for slopes alone, which need to be known to a part of themselves."""
+
+REFINED = (0.5, 0.35, 0.2, 0.07)
+"""Parts of the pixels that show the ball that get each of the next, at most."""
 
 TOLERATED = 0.1
-"""Part of the noise that an error of a pixel may be without the most samples. At 64 samples those
-next to the rim of the bench's ball are as far off as a noise of 1 %, alike in all bands; at 1024 a
-tenth of that."""
+"""Part that an error of a pixel may be of the noise of its channels' mean, since such errors are
+alike in all channels, without still more samples. At 64 samples those next to the rim of the
+bench's ball are as far off as a noise of 1 %; at 1024 a tenth of that."""
 
 HELD = 1e3
 """Weight against which directions that are held move, where the residual's norm is 1."""
@@ -118,6 +121,9 @@ UNDERSTATED = " In this scene derivatives do not know how {} move: these errors 
 
 UNFINISHED = " The fit was stopped: its answer may lie many of these errors away."
 """What has to be said of errors that are those about a point, which is no minimum yet."""
+
+PROFILE = np.arange(-3.0, 4.0)
+"""Places, in errors of n_d, at which the sum of squares is looked at along its way."""
 
 POLISH = 6
 """Steps more, at most, where more than the glass is free: a scene's numbers move the picture less
@@ -224,7 +230,7 @@ class Uncertainty:
         summary: the same in a sentence.
         prior: "none", "catalogue" or "fixed-c3".
         noise: standard deviation of the picture's values, as given.
-        samples: film samples per pixel: of most pixels, of the hardest.
+        samples: film samples per pixel, the fewest first.
         free: what else is free.
     """
 
@@ -285,7 +291,7 @@ class FitResult:
         nearest_glasses: names of catalogue glasses and their distance in standard deviations.
         prior: "none", "catalogue" or "fixed-c3".
         noise: the noise that the errors refer to; None where it was estimated from the residual.
-        samples: film samples per pixel of the last level: of most pixels, of the hardest.
+        samples: film samples per pixel of the last level, the fewest first.
         picture: (height, width, channels) render with the fitted glass, exposed as the target.
         free: what else was free.
         used: (height, width) pixels that the fit went by; None where it was all of them.
@@ -713,9 +719,10 @@ def _expected(problem: Problem, prior: str, noise: float) -> Uncertainty:
     problem = problem._replace(free=problem.free._replace(brightest=brightest))
     many = _level(problem, LAST, 1, FEW_SAMPLES, 50, 0, SPLITS[0])
     some = _linearise(problem, many, at, CUTOFF)
-    level = _more_samples(problem, many, few, some, 50, noise)
-    along = _for_slopes(problem, many, 50, 0)
-    known = (some if along is many else _linearise(problem, along, at, CUTOFF)).columns
+    level, slopes = _more_samples(problem, many, few, some, at, 50, noise)
+    known = some.columns
+    if problem.free.parameters:
+        known = _linearise(problem, slopes, at, CUTOFF).columns
     seen = _linearise(problem, level, at, CUTOFF, known, of_index=True)
     # A pixel's weight says how much of its residual is what samples leave open, beside the noise:
     # all residuals, weighed, are to be as large as the noise.
@@ -1270,6 +1277,7 @@ class Descent(NamedTuple):
         converged: whether a next step would change nothing that the picture can tell.
         spread: of misfits that are no outliers, where the loss is robust; else 0.
         anchor: where z stays if the picture says nothing.
+        wider: (total,) how far q is open beside the noise, since the picture is not linear.
     """
 
     at: Point
@@ -1278,6 +1286,7 @@ class Descent(NamedTuple):
     converged: bool
     spread: float
     anchor: np.ndarray
+    wider: np.ndarray | float = 0.0
 
 
 def _descend(
@@ -1289,6 +1298,7 @@ def _descend(
     small: float,
     along: Level | None = None,
     smooth: bool = False,
+    known: Columns | None = None,
 ) -> Descent:
     """Gauss-Newton steps from a point, `most` at most, until one is small.
 
@@ -1301,6 +1311,7 @@ def _descend(
         small: a step that changes the picture by less than this part of its noise is the last.
         along: where slopes are taken; by default on the level itself.
         smooth: whether B and C move along the `Coefficients.smooth` directions alone.
+        known: slopes that hold wherever the steps lead; none are taken then.
     """
 
     def keep() -> None:
@@ -1311,10 +1322,11 @@ def _descend(
         if all(lin.cost <= end.lin.cost for end in others):
             problem.kept[:] = [(level, now)]
 
-    def look(at: Point, known: Columns | None = None) -> Linearised:
-        if known is None and along is not None:
-            known = _linearise(problem, along, at, cutoff).columns
-        return _linearise(problem, level, at, cutoff, known, of_index=along is not None)
+    def look(at: Point, near: Columns | None = None) -> Linearised:
+        slopes, kept = known or near, known is not None or along is not None
+        if slopes is None and along is not None:
+            slopes = _linearise(problem, along, at, cutoff).columns
+        return _linearise(problem, level, at, cutoff, slopes, of_index=kept)
 
     unknowns = problem.unknowns
     least = LEAST_CHANGE[0] if problem.film.wavelengths is not None else LEAST_CHANGE[1]
@@ -1371,8 +1383,10 @@ def _n_d(unknowns: Unknowns, z: np.ndarray) -> float:
     return float(unknowns.coefficients.index(z, np.array([LINE_D]))[0])
 
 
-def _refined(problem: Problem, few: Descent, level: Level, depth: int) -> tuple[Level, Point]:
-    """A whole picture with samples as `SPLITS` says, and the point to go on from.
+def _refined(
+    problem: Problem, few: Descent, level: Level, depth: int
+) -> tuple[tuple[Level, Level], Point]:
+    """Whole pictures with samples as `_more_samples` says, and the point to go on from.
 
     Args:
         problem: what stays the same.
@@ -1384,24 +1398,7 @@ def _refined(problem: Problem, few: Descent, level: Level, depth: int) -> tuple[
     at, _ = _next_point(problem.unknowns, few.at, few.at.z, some, 0.0)
     residual = np.abs(some.score)[some.weight > 0]
     shown = _deviation(residual, np.ones_like(residual))
-    return _more_samples(problem, level, few.lin, some, depth, shown), at
-
-
-def _for_slopes(problem: Problem, many: Level, depth: int, seed: int) -> Level:
-    """The whole picture from which the last level takes its slopes, but for those of last steps.
-
-    Few samples tell the slopes, and many what is left: at its end a fit has to know this to a part
-    of the noise, and those to a part of themselves.
-
-    Args:
-        problem: what stays the same.
-        many: the whole picture with as many samples as most pixels get.
-        depth: segments of a path.
-        seed: of the render.
-    """
-    if problem.free.parameters:  # slopes next to an outline are steep
-        return _level(problem, LAST, 1, FEW_SAMPLES, depth, seed, SPLITS[1])
-    return many
+    return _more_samples(problem, level, few.lin, some, few.at, depth, shown), at
 
 
 def _more_samples(
@@ -1409,58 +1406,78 @@ def _more_samples(
     level: Level,
     few: Linearised,
     some: Linearised,
+    at: Point,
     depth: int,
     noise: float,
-) -> Level:
+) -> tuple[Level, Level]:
     """A whole picture with samples as `SPLITS` says, weighed by how well they draw each pixel.
 
     Near the rim a ball shows the whole scene within a few pixels, where footprints are neither
     small nor straight. The pixels that tell most and change most with the samples get more of
-    them, and most of them where what is left is no small part of the noise. Since that falls about
-    as the area of a footprint, the render of fewer samples, weighed against that of more, cancels
+    them, and those of them that still change much still more. Since what is left falls about as
+    the area of a footprint, the render of fewer samples, weighed against that of more, cancels
     most of it.
 
     Args:
         problem: what stays the same.
         level: the whole picture with as many samples as most pixels get.
         few: the picture of few samples.
-        some: that of as many as most pixels get, at the same point.
+        some: that of as many as most pixels get.
+        at: where both are.
         depth: segments of a path.
         noise: of the target's values.
+
+    Returns:
+        The picture, and one with no more than `FOR_SLOPES`, for the slopes of a fit's last steps.
 
     Source:
         Richardson, Phil. Trans. A 210 (1911) 307, extrapolation to a step of zero.
     """
-    sigma = max(noise, CLEAN * problem.free.brightest)
+    of_scene, sigma = bool(problem.free.parameters), max(noise, CLEAN * problem.free.brightest)
     change, seen = np.abs(some.picture - few.picture), int(np.sum(some.weight.any(axis=1)))
     told, changed = np.max(change * some.weight, axis=1), np.max(change, axis=1)
-    if problem.free.parameters:
+    if of_scene:
         # Of these an outline tells most, where the index may show hardly at all.
         told = changed = _around(problem, level.blocks, changed)
-    order = np.argsort(-told)
-    hard, hardest = np.zeros(len(change), bool), np.zeros(len(change), bool)
-    hard[order[: int(seen * REFINED[0])]] = True
     # What a quarter of the samples changes tells the error of these, and that of more.
-    error = changed / 3
-    second = SPLITS[1] if problem.free.parameters else OF_GLASS_ALONE
-    error[hard] *= (SPLITS[0] / second) ** 2
-    if problem.free.parameters:
-        hardest = hard & (error > TOLERATED * sigma)
-        hardest[order[np.cumsum(hardest[order]) > seen * REFINED[1]]] = False
-        error[hardest] *= (second / SPLITS[2]) ** 2
-    parts = [(~hard, SPLITS[0], 1.0)]
-    for which, fewer, more in ((hard & ~hardest, SPLITS[0], second), (hardest, second, SPLITS[2])):
-        ratio = (more / fewer) ** 2
-        parts += [(which, fewer, -1 / (ratio - 1)), (which, more, ratio / (ratio - 1))]
-    rows = [np.flatnonzero(which) for which, _, _ in parts]
-    return level._replace(
-        parts=tuple(
-            _part(problem, 1, FEW_SAMPLES, depth, level.blocks[row], row, split, share)
-            for row, (_, split, share) in zip(rows, parts, strict=True)
-            if len(row)
-        ),
-        weights=1 / (1 + (error[:, None] / sigma) ** 2),
-    )
+    error, picture = changed / 3, some.picture.copy()
+    tolerated = TOLERATED * sigma / np.sqrt(problem.film.channels)
+    gains, black = problem.free.exposure(at.others)
+    splits = SPLITS if of_scene else OF_GLASS_ALONE
+    rows, pairs = np.arange(len(change)), []
+    for step, (fewer, more) in enumerate(itertools.pairwise(splits)):
+        chosen = np.argsort(-told)[: int(seen * REFINED[step])]
+        if step:
+            chosen = chosen[error[rows[chosen]] > tolerated]
+        further = np.zeros(len(rows), bool)
+        further[chosen] = True
+        pairs.append((rows[~further], splits[: step + 1]))
+        rows = rows[further]
+        error[rows] *= (fewer / more) ** 2
+        if len(rows) and more < splits[-1]:
+            part = _part(problem, 1, FEW_SAMPLES, depth, level.blocks[rows], rows, more)
+            traced = _trace(problem, part, at, level.seed, CUTOFF, False, False)
+            finer = traced[:, 0] * gains + black
+            changed = np.max(np.abs(finer - picture[rows]), axis=1)
+            picture[rows], error[rows] = finer, changed / 3
+            told = _around(problem, level.blocks[rows], changed)
+        else:
+            told = told[further]
+    pairs.append((rows, splits))
+    weighed = level._replace(weights=1 / (1 + (error[:, None] / sigma) ** 2))
+
+    def drawn(most: int) -> Level:
+        parts = []
+        for rows, path in pairs:
+            *_, fewer, more = (0, *(split for split in path if split <= most))
+            ratio = (more / fewer) ** 2 if fewer else np.inf
+            for split, share in ((fewer, -1 / (ratio - 1)), (more, 1 + 1 / (ratio - 1))):
+                if split and len(rows):
+                    blocks = level.blocks[rows]
+                    parts.append(_part(problem, 1, FEW_SAMPLES, depth, blocks, rows, split, share))
+        return weighed._replace(parts=tuple(parts))
+
+    return drawn(splits[-1]), drawn(FOR_SLOPES)
 
 
 def _around(problem: Problem, blocks: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -1719,29 +1736,87 @@ def _search(problem: Problem, target: Picture) -> "tuple[Level, Descent]":
     along = None
     if target.samples is None:
         level = _level(problem, FEW, 1, FEW_SAMPLES, depth, seed)
-        many = _level(problem, LAST, 1, FEW_SAMPLES, depth, seed, SPLITS[0])
+        along = _level(problem, LAST, 1, FEW_SAMPLES, depth, seed, SPLITS[0])
         small = FEW_STEP if problem.free.parameters else 1.0
         best = _descend(problem, level, best.at, CUTOFF, 20, small)
-        level, at = _refined(problem, best, many, depth)
-        along = _for_slopes(problem, many, depth, seed)
+        (finest, level), at = _refined(problem, best, along, depth)
     else:
         level, at = _level(problem, LAST, 1, target.samples, depth, seed), best.at
+        finest = level
     best = _descend(problem, level, at, CUTOFF, 30, LINEAR_STEP, along)
-    if problem.free.parameters and best.converged:
-        # The index may be told much less well than what it is mixed up with: slopes that are a few
-        # per cent rough then move it by as much as the noise does.
-        polished = _descend(problem, level, best.at, CUTOFF, POLISH, SMALL_STEP)
-        best = polished._replace(steps=best.steps + polished.steps, converged=True)
     if level.robust is not None:
-        level = level._replace(robust=Robust("tukey", best.spread))
+        tukey = Robust("tukey", best.spread)
+        level, finest = (each._replace(robust=tukey) for each in (level, finest))
         cut = _descend(problem, level, best.at, CUTOFF, 30, LINEAR_STEP, along)
         best = cut._replace(steps=best.steps + cut.steps)
     error = best.lin.noise / max(float(np.max(np.abs(best.lin.eliminated().r))), 1e-300)
     if NEGLECTED * CUTOFF > SMALL_STEP * error:
         # So clean a picture shows the light of the paths that were ended early.
-        exact = _descend(problem, level, best.at, 0.0, 30, SMALL_STEP, along)
+        if problem.free.parameters and target.samples is None:
+            along = level
+        exact = _descend(problem, finest, best.at, 0.0, 30, SMALL_STEP, along)
         best = exact._replace(steps=best.steps + exact.steps)
-    return level, best
+    elif problem.free.parameters and best.converged and best.lin.seen:
+        best = _polished(problem, finest, level, best)
+    return finest, best
+
+
+def _polished(problem: Problem, level: Level, slopes: Level, end: Descent) -> Descent:
+    """Where steps end that know the slopes well, and then the mean along the least known way.
+
+    Where the scene's numbers are free, n_d may be told much less well than what it is mixed up
+    with. Slopes that are a few per cent rough then move it by as much as the noise does; and over
+    what is left open a picture is no longer linear: next to its rim a ball shows edges so close
+    together that they pass whole pixels. So the sum of squares is looked at along the way that
+    n_d and all else go together: its minimum may lie in a ripple of it, but the mean over what it
+    makes likely, and the spread about that, know how wide it is.
+
+    Args:
+        problem: what stays the same.
+        level: the resolution.
+        slopes: where slopes are taken.
+        end: where the steps ended.
+
+    Source:
+        Bates and Watts, Nonlinear Regression Analysis and Its Applications (Wiley, 1988), chapter
+        6, profiles; the mean in place of the minimum is Bayes' under an even prior.
+    """
+    unknowns, free = problem.unknowns, problem.free
+    known = _linearise(problem, slopes, end.at, CUTOFF).columns
+    best = _descend(problem, level, end.at, CUTOFF, POLISH, SMALL_STEP, known=known)
+    level, lin = _rescaled(level, best.lin, free.brightest)
+    z, steps = jnp.asarray(best.at.z), end.steps + best.steps
+    covariance = _covariance(unknowns, z, lin, lin.noise**2 * lin.white + lin.held, lin.noise)
+    index = unknowns.coefficients.index(z, unknowns.reference)
+    to_logs = np.diag(jax.jacfwd(unknowns.coefficients.logarithms)(z))
+    n_d = np.asarray(jax.jacfwd(lambda z: _line_figures(unknowns.coefficients, z)[0])(z))
+    told = covariance[:, free.total :] @ (n_d / to_logs)
+    told /= np.sqrt((n_d / to_logs) @ told[free.total :])
+    of_index = np.asarray(jax.jacfwd(lambda z: unknowns.change(z, index))(z)) / to_logs
+    way = lin.r @ np.concatenate([told[: free.total], of_index @ told[free.total :]])
+
+    def moved(places: float) -> tuple[Point, Linearised]:
+        at, _ = _next_point(unknowns, best.at, best.anchor, lin._replace(q=-places * way), 0.0)
+        return at, _linearise(problem, level, at, CUTOFF, known, of_index=True)
+
+    costs = []
+    for place in PROFILE:
+        at, there = moved(place)
+        costs.append(_objective(unknowns, there, at, best.anchor, lin.noise))
+        steps += 1
+        problem.progress(steps, there.rms, _n_d(unknowns, at.z))
+    mean, spread = _mean_place(np.array(costs) / lin.noise**2)
+    at, there = moved(mean)
+    wider = np.sqrt(max(spread**2 - 1, 0.0)) * way
+    return Descent(at, there, steps + 1, True, end.spread, best.anchor, wider)
+
+
+def _mean_place(squares: np.ndarray) -> tuple[float, float]:
+    """Mean and standard deviation over `PROFILE`, from squares there in units of the noise's."""
+    likely = np.exp(-(squares - np.min(squares)) / 2)
+    likely /= np.sum(likely)
+    mean = float(likely @ PROFILE)
+    return mean, float(np.sqrt(likely @ (PROFILE - mean) ** 2))
 
 
 class Noise(NamedTuple):
@@ -1773,6 +1848,7 @@ def _result(
     if given is not None and level.robust is not None and noise.meat is not lin.meat:
         # A robust loss pays a little information, and outliers take some.
         noise = noise._replace(meat=noise.meat * (max(lin.noise, given) / given) ** 2)
+    noise = noise._replace(meat=noise.meat + np.multiply.outer(end.wider, end.wider))
     known = _uncertainty(problem, end.at, level, lin, noise, prior, "This picture fixes", own)
     glass = Sellmeier(known.B, known.C, object_glass(problem.scene, problem.number).validity)
     converged, message = _verdict(end)
@@ -1897,7 +1973,7 @@ def _uncertainty(
         + _edges_without(level.parts[0].plan, bool(free.parameters)),
         prior=prior,
         noise=noise.sigma,
-        samples=tuple(part.plan.samples * part.split**2 for part in level.parts),
+        samples=tuple(sorted({part.plan.samples * part.split**2 for part in level.parts})),
         free=tuple(_free_values(free, scene, at.others, errors)),
     )
 
