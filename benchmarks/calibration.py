@@ -99,8 +99,17 @@ def scores(result: FitResult) -> dict[str, list[float]]:
     }
 
 
-def calibrate(case: Case, film: Film, repeats: int) -> list[dict[str, Any]]:
-    """Figures of the z-scores of one case; Ctrl-C ends it with the fits that are done."""
+def calibrate(
+    case: Case, film: Film, repeats: int, before: list[dict[str, Any]]
+) -> list[dict[str, Any]]:
+    """Figures of the z-scores of one case; Ctrl-C ends it with the fits that are done.
+
+    Args:
+        case: the kind of picture.
+        film: its size and bands.
+        repeats: how many fits there are to be.
+        before: rows of those that there are.
+    """
     start = load_scene(str(TARGET_SCENE))
     shown = with_glass(start, 0, named_glass(TARGET_GLASS))
     shown = displaced(shown) if "ball.center" in case.free else shown
@@ -108,8 +117,10 @@ def calibrate(case: Case, film: Film, repeats: int) -> list[dict[str, Any]]:
     clean = np.asarray(picture) * (TRUE["gain"] if "gain" in case.free else 1.0)
     clean += TRUE["black"] if "black" in case.free else 0.0
     found: dict[str, list[float]] = {"n_d": [], "V_d": [], "n": [], "free": []}
-    failed, errors, seconds = 0, [], []
-    for seed in range(repeats):
+    found |= {row["of"]: list(row["z"]) for row in before}
+    failed = before[0]["failed"] if before else 0
+    errors, seconds = [], []
+    for seed in range(len(found["n_d"]), repeats):
         noisy = clean + case.noise(clean, np.random.default_rng(seed))
         begun = time.perf_counter()
         try:
@@ -128,6 +139,8 @@ def calibrate(case: Case, film: Film, repeats: int) -> list[dict[str, Any]]:
             f"{case.name}: {seed + 1} of {repeats}, z {np.mean(n_d):.2f} ± {np.std(n_d):.2f}",
             file=sys.stderr,
         )
+    if not seconds:
+        return []
     return [
         {
             "case": case.name,
@@ -136,11 +149,12 @@ def calibrate(case: Case, film: Film, repeats: int) -> list[dict[str, Any]]:
             "std": float(np.std(z)),
             "within_1": float(np.mean(np.abs(z) < 1)),
             "n_d_std": statistics.median(errors),
-            "fits": len(seconds),
+            "fits": len(found["n_d"]),
             "failed": failed,
             "fit_s": statistics.median(seconds),
             "cores": machine()["cores"],
             "date": datetime.now(UTC).date().isoformat(),
+            "z": z,
         }
         for name, z in found.items()
         if z
@@ -154,6 +168,7 @@ def main() -> None:
     add("--repeats", type=int, default=200, help="fits of each case")
     add("--size", type=int, default=48, help="pixels along each edge")
     add("--bands", type=int, default=8, help="equal ones from 400 to 700 nm")
+    add("--more", action="store_true", help="go on from the fits in the record, of the same code")
     add("--only", nargs="+", choices=[case.name for case in CASES], help="of the cases")
     options = parser.parse_args()
     film = Film(options.size, options.size, band_middles(400.0, 700.0, options.bands))
@@ -162,10 +177,12 @@ def main() -> None:
     for case in CASES:
         if options.only and case.name not in options.only:
             continue
-        found = calibrate(case, film, options.repeats)
+        before = [row for row in rows if row["case"] == case.name and options.more and "z" in row]
+        found = calibrate(case, film, options.repeats, before)
         if not found:  # stopped before its first fit
             continue
-        print_table(list(found[0]), [list(row.values()) for row in found])
+        shown = [{name: x for name, x in row.items() if name != "z"} for row in found]
+        print_table(list(shown[0]), [list(row.values()) for row in shown])
         rows = [row for row in rows if row["case"] != case.name] + found
         write_record("calibration", vars(options) | {"noise": NOISE}, {"scores": rows})
 
