@@ -149,6 +149,8 @@ def calibrate(
             "std": float(np.std(z)),
             "within_1": float(np.mean(np.abs(z) < 1)),
             "n_d_std": statistics.median(errors),
+            "size": film.width,
+            "bands": film.channels,
             "fits": len(found["n_d"]),
             "failed": failed,
             "fit_s": statistics.median(seconds),
@@ -177,8 +179,9 @@ def main() -> None:
     for case in CASES:
         if options.only and case.name not in options.only:
             continue
-        before = [row for row in rows if row["case"] == case.name and options.more and "z" in row]
-        found = calibrate(case, film, options.repeats, before)
+        alike = {"case": case.name, "size": options.size, "bands": options.bands}
+        before = [row for row in rows if "z" in row and alike.items() <= row.items()]
+        found = calibrate(case, film, options.repeats, before if options.more else [])
         if not found:  # stopped before its first fit
             continue
         shown = [{name: x for name, x in row.items() if name != "z"} for row in found]

@@ -1452,7 +1452,7 @@ def _more_samples(
         further = np.zeros(len(rows), bool)
         further[chosen] = True
         pairs.append((rows[~further], splits[: step + 1]))
-        rows = rows[further]
+        rows, told = rows[further], told[further]
         error[rows] *= (fewer / more) ** 2
         if len(rows) and more < splits[-1]:
             part = _part(problem, 1, FEW_SAMPLES, depth, level.blocks[rows], rows, more)
@@ -1461,8 +1461,6 @@ def _more_samples(
             changed = np.max(np.abs(finer - picture[rows]), axis=1)
             picture[rows], error[rows] = finer, changed / 3
             told = _around(problem, level.blocks[rows], changed)
-        else:
-            told = told[further]
     pairs.append((rows, splits))
     weighed = level._replace(weights=1 / (1 + (error[:, None] / sigma) ** 2))
 
@@ -1788,15 +1786,17 @@ def _polished(problem: Problem, level: Level, slopes: Level, end: Descent) -> De
     z, steps = jnp.asarray(best.at.z), end.steps + best.steps
     covariance = _covariance(unknowns, z, lin, lin.noise**2 * lin.white + lin.held, lin.noise)
     index = unknowns.coefficients.index(z, unknowns.reference)
-    to_logs = np.diag(jax.jacfwd(unknowns.coefficients.logarithms)(z))
-    n_d = np.asarray(jax.jacfwd(lambda z: _line_figures(unknowns.coefficients, z)[0])(z))
-    told = covariance[:, free.total :] @ (n_d / to_logs)
-    told /= np.sqrt((n_d / to_logs) @ told[free.total :])
-    of_index = np.asarray(jax.jacfwd(lambda z: unknowns.change(z, index))(z)) / to_logs
+    of_index = _along_logs(unknowns.coefficients, lambda z: unknowns.change(z, index), z)
+    of_n_d = _along_logs(
+        unknowns.coefficients, lambda z: _line_figures(unknowns.coefficients, z), z
+    )[0]
+    told = covariance[:, free.total :] @ of_n_d
+    told /= np.sqrt(of_n_d @ told[free.total :])
     way = lin.r @ np.concatenate([told[: free.total], of_index @ told[free.total :]])
 
     def moved(places: float) -> tuple[Point, Linearised]:
-        at, _ = _next_point(unknowns, best.at, best.anchor, lin._replace(q=-places * way), 0.0)
+        shifted = lin._replace(q=lin.q - places * way)
+        at, _ = _next_point(unknowns, best.at, best.anchor, shifted, 0.0)
         return at, _linearise(problem, level, at, CUTOFF, known, of_index=True)
 
     costs = []
@@ -1934,10 +1934,9 @@ def _uncertainty(
         source += f", and with {' and '.join(free.names)} free"
     whole = _covariance(unknowns, z, lin, noise.meat, noise.sigma)
     covariance = whole[free.total :, free.total :]
-    to_logs = jax.jacfwd(unknowns.coefficients.logarithms)(z)
 
     def with_error(f: Callable[[jax.Array], jax.Array]) -> tuple[np.ndarray, np.ndarray]:
-        slope = np.asarray(jax.jacfwd(f)(z)) / np.diag(to_logs)
+        slope = _along_logs(unknowns.coefficients, f, z)
         return np.asarray(f(z)), np.sqrt(np.sum((slope @ covariance) * slope, axis=-1))
 
     waves = COLOR_WAVELENGTHS if film.wavelengths is None else np.asarray(film.wavelengths)
@@ -2052,8 +2051,7 @@ def _covariance(
     """
     left, p = lin.eliminated(), lin.columns.others
     index = unknowns.coefficients.index(z, unknowns.reference)
-    to_logs = jnp.diag(jax.jacfwd(unknowns.coefficients.logarithms)(z))
-    slope = np.asarray(jax.jacfwd(lambda z: unknowns.change(z, index))(z) / to_logs[None, :])
+    slope = _along_logs(unknowns.coefficients, lambda z: unknowns.change(z, index), z)
     rows = np.concatenate([left.r @ slope / noise, unknowns.prior_rows], axis=0)
     basis, scales, right = np.linalg.svd(rows, full_matrices=True)
     count, m = len(scales), len(left.r)
@@ -2074,6 +2072,12 @@ def _covariance(
     rest[:count] = (1 / (1 + (scales * WIDEST) ** 2)) * WIDEST**2 / (1 + (scales * WIDEST) ** 2)
     spread = np.concatenate([follow, np.eye(len(z))]) @ right.T
     return whole @ within @ whole.T + (spread * rest) @ spread.T
+
+
+def _along_logs(coefficients: Coefficients, of: Callable[[Any], Array], z: Array) -> np.ndarray:
+    """Derivative (k, free) of `of`, (k,) at `z`, along log |B| and log C of the free ones."""
+    to_logs = jnp.diag(jax.jacfwd(coefficients.logarithms)(z))
+    return np.asarray(jax.jacfwd(of)(z) / to_logs[None, :])
 
 
 def _edges_without(plan: Plan, moves: bool) -> str:
