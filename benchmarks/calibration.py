@@ -6,13 +6,17 @@ of 1, and 68 % of them should lie within 1.
 """
 
 import argparse
+import multiprocessing
+import os
+import signal
 import statistics
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -99,6 +103,41 @@ def scores(result: FitResult) -> dict[str, list[float]]:
     }
 
 
+class Fitted(NamedTuple):
+    """What one fit found.
+
+    Args:
+        scores: as `scores` has them.
+        n_d_std: the error reported.
+        converged: whether it says so.
+        seconds: that it took.
+    """
+
+    scores: dict[str, list[float]]
+    n_d_std: float
+    converged: bool
+    seconds: float
+
+
+def repeated(case: Case, clean: np.ndarray, film: Film, seed: int) -> Fitted:
+    """A fit of a picture with noise."""
+    noisy = clean + case.noise(clean, np.random.default_rng(seed))
+    start, begun = load_scene(str(TARGET_SCENE)), time.perf_counter()
+    result = fit(start, Picture(noisy, film.wavelengths), free=case.free, noise=case.given)
+    taken = time.perf_counter() - begun
+    return Fitted(scores(result), result.n_d_std, result.converged, taken)
+
+
+def own_core(cores: "multiprocessing.Queue[int]") -> None:
+    """Keep this process to one core, where the system can: two threads of a fit idle a third.
+
+    Ctrl-C is left to the process that collects.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {cores.get()})
+
+
 def calibrate(
     case: Case, film: Film, repeats: int, before: list[dict[str, Any]]
 ) -> list[dict[str, Any]]:
@@ -120,25 +159,29 @@ def calibrate(
     found |= {row["of"]: list(row["z"]) for row in before}
     failed = before[0]["failed"] if before else 0
     errors, seconds = [], []
-    for seed in range(len(found["n_d"]), repeats):
-        noisy = clean + case.noise(clean, np.random.default_rng(seed))
-        begun = time.perf_counter()
-        try:
-            result = fit(start, Picture(noisy, film.wavelengths), free=case.free, noise=case.given)
-        except KeyboardInterrupt:
-            break
-        if result.stopped:
-            break
-        seconds.append(time.perf_counter() - begun)
-        failed += not result.converged
-        errors.append(result.n_d_std)
-        for name, values in scores(result).items():
-            found[name] += values
-        n_d = np.array(found["n_d"])
-        print(
-            f"{case.name}: {seed + 1} of {repeats}, z {np.mean(n_d):.2f} ± {np.std(n_d):.2f}",
-            file=sys.stderr,
-        )
+    # A process that is forked from one with threads may hang.
+    context = multiprocessing.get_context("spawn")
+    count, cores = machine()["cores"], context.Queue()
+    for core in sorted(os.sched_getaffinity(0) if hasattr(os, "sched_setaffinity") else ()):
+        cores.put(core)
+    with context.Pool(count, own_core, (cores,)) as pool:
+        seeds = range(len(found["n_d"]), repeats)
+        fits = pool.imap(partial(repeated, case, clean, film), seeds)
+        for seed in seeds:
+            try:
+                fitted = next(fits)
+            except KeyboardInterrupt:
+                break
+            seconds.append(fitted.seconds)
+            failed += not fitted.converged
+            errors.append(fitted.n_d_std)
+            for name, values in fitted.scores.items():
+                found[name] += values
+            n_d = np.array(found["n_d"])
+            print(
+                f"{case.name}: {seed + 1} of {repeats}, z {np.mean(n_d):.2f} ± {np.std(n_d):.2f}",
+                file=sys.stderr,
+            )
     if not seconds:
         return []
     return [
@@ -154,7 +197,7 @@ def calibrate(
             "fits": len(found["n_d"]),
             "failed": failed,
             "fit_s": statistics.median(seconds),
-            "cores": machine()["cores"],
+            "cores": 1,
             "date": datetime.now(UTC).date().isoformat(),
             "z": z,
         }
@@ -173,6 +216,7 @@ def main() -> None:
     add("--more", action="store_true", help="go on from the fits in the record, of the same code")
     add("--only", nargs="+", choices=[case.name for case in CASES], help="of the cases")
     options = parser.parse_args()
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
     film = Film(options.size, options.size, band_middles(400.0, 700.0, options.bands))
     # Hours of work: what is done is kept, whatever becomes of the rest, and until it is done anew.
     rows: list[dict[str, Any]] = recorded("calibration")["scores"]
