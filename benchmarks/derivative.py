@@ -55,10 +55,10 @@ MOST_ORDERS = 2000
 """For rays so close to grazing that they hardly lose light: fewer than one in a million."""
 OUTLINE_SAMPLES, OUTLINE_STEP = (1600, 2116), 2e-3
 """Of the pictures whose differences tell how a lamp's outline moves, and the step in n."""
-SCATTERED_SIZE, SCATTERED_SAMPLES, SCATTERED_STEP = 48, 32768, 5e-4
+SCATTERED_SIZE, SCATTERED_SAMPLES, SCATTERED_STEP = 48, 131072, 1.25e-4
 """Of the pictures whose differences tell how the edges of a matte ground move, and the step: with
-one of 2e-3 images reflected twice within the ball move by a pixel, and such differences are 4 % off
-these."""
+one of 5e-4 images next to the rim move so far that the square of what such differences are off is
+0.001 of theirs, as much as the derivative's own."""
 PLASTIC = 1.32471795724474602596
 """Root of x³ = x + 1, for evenly spread points. Source: Roberts, The unreasonable effectiveness
 of quasirandom sequences (2018)."""

@@ -1,5 +1,7 @@
 """Derivatives where paths scatter, against differences of hard-edged pictures by the other loop."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,10 +11,11 @@ from helpers import WHITE, ball, ground, matte
 from diffdisp.camera import Camera
 from diffdisp.dispersion import Sellmeier
 from diffdisp.film import Film
+from diffdisp.geometry import Sphere
 from diffdisp.material import Lambertian
 from diffdisp.rendering import render
-from diffdisp.scene import Background, Scene, with_glass
-from diffdisp.texture import Checker2D
+from diffdisp.scene import Background, Object, Scene, with_glass
+from diffdisp.texture import Checker, Checker2D
 
 N, STEP = 1.52, 4e-3
 FILM = Film(24, 24, np.array([0.55]))
@@ -71,3 +74,24 @@ def test_a_white_ball_before_white_is_not_seen():
     white = scene(BEHIND.camera, matte(1.0, (0.25, 0.2, -3), 0.5))
     value = jax.jit(lambda n: jax.jvp(lambda n: picture(white, n, 256, "float64"), (n,), (1.0,))[0])
     assert abs(np.mean(value(jnp.asarray(N))) - 1) < 1.2e-3
+
+
+def test_cubes_near_a_horizon_seen_through_a_ball():
+    # A row of pixels that each show four cubes and a horizon. The scene is its own mirror image
+    # but for the colours of its cubes, so that the difference of both halves is of those alone.
+    checker = Checker([0.1] * 3, [0.9] * 3, 6.0)
+    globe = Object(Sphere((0, -101, 0), 100.0), Lambertian(checker))
+    level = scene(Camera((0, 0.6, 3.2), (0, -0.1, 0), vertical_fov=21.73), globe)
+
+    def row(loop, samples, dtype, seed):
+        seen = partial(picture, level, samples=samples, dtype=dtype, seed=seed)
+        return np.asarray(loop(seen)(jnp.asarray(N)), float)[12]
+
+    def of_derivatives(seen):
+        return jax.jit(lambda n: jax.jvp(seen, (n,), (1.0,))[0])
+
+    found = row(of_derivatives, 1024, "float64", 1)
+    off = found - row(jax.jit, 16384, "float32", 2)
+    odd = 0.5 * (off - off[::-1])
+    print(f"{np.sqrt(np.mean(odd**2)):.4f}")
+    assert np.sqrt(np.mean(odd**2)) < 0.003

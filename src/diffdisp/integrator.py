@@ -1309,8 +1309,23 @@ def _part_met(
     surface: Array, ray: Ray, footprint: tuple[Ray, Ray], world: World, plan: Plan
 ) -> Real:
     """Part of a footprint that meets a surface, were there nothing before it; 1 for balls."""
-    part = jnp.ones_like(ray.direction.x)
-    pointed = _all_zero(footprint)
+    outlined, depth, edges = _outline_met(surface, ray, footprint, world, plan)
+    return jnp.where(outlined & ~_all_zero(footprint), covered(depth, *edges), 1.0)
+
+
+def _outline_met(
+    surface: Array, ray: Ray, footprint: tuple[Ray, Ray], world: World, plan: Plan
+) -> tuple[Array, Real, tuple[Real, Real]]:
+    """How far within the outline of a surface a footprint lies.
+
+    Returns:
+        Whether the surface has one: no ball of glass, nor what surrounds the ray. Of a sphere its
+        `sphere_depth`, of a plane the cosine to it, both below 0 beyond the outline. And the
+        changes of that along both edges.
+    """
+    depth: Real = jnp.ones_like(ray.direction.x)
+    edges: tuple[Real, Real] = (0.0 * depth, 0.0 * depth)
+    outlined: Array = jnp.zeros(surface.shape, bool)
     if plan.spheres > plan.balls:
         before_planes = surface < plan.first_plane
         lamp = (surface >= plan.first_lamp) & (surface < plan.first_lamp + plan.lamps)
@@ -1319,48 +1334,20 @@ def _part_met(
         center, radius = _pick_vector(world.centers, row), _pick(world.radii, row)
         _, depth, edges = sphere_depth(ray, footprint, center, radius)
         outside = _starts_outside(ray, center, radius)
-        counts = ((before_planes & (surface >= plan.balls)) | lamp) & outside & ~pointed
-        part = jnp.where(counts, covered(depth, *edges), part)
+        outlined = jnp.asarray(((before_planes & (surface >= plan.balls)) | lamp) & outside)
     if plan.planes:
         plane = _plane_row(surface, plan)
         normal = _pick_vector(world.normals, plane)
         height = (ray.origin - _pick_vector(world.points, plane)).dot(normal)
         side = jnp.where(height < 0, 1.0, -1.0)
-        tilts = (edge.direction.dot(normal) * side for edge in footprint)
-        on_plane = (surface >= plan.first_plane) & (surface < plan.first_lamp)
+        across, down = (edge.direction.dot(normal) * side for edge in footprint)
+        cosine = ray.direction.dot(normal) * side
+        matte = (surface >= plan.first_plane) & (surface < plan.first_lamp)
         screen = (surface >= plan.first_lamp + plan.lamps) & (surface < plan.background)
-        horizon = covered(ray.direction.dot(normal) * side, *tilts)
-        part = jnp.where((on_plane | screen) & ~pointed, horizon, part)
-    return part
-
-
-def _seen_flat(path: Path, tables: Tables, plan: Plan) -> Array:
-    """Whether a footprint is seen so flat by the surface that it meets that tiles are their mean.
-
-    Where its middle passes the surface, its foot says nothing of how far the part beyond the
-    outline reaches: on a plane to infinity.
-    """
-    assert path.footprint is not None
-    ray, footprint = jax.lax.stop_gradient((path.ray, path.footprint))
-    world = tables.world
-    surface, pointed = path.surface, _all_zero(path.footprint)
-    flat: Array = jnp.zeros(surface.shape, bool)
-    if plan.first_plane > plan.balls:
-        row = jnp.clip(surface, 0, plan.first_plane - 1)
-        center, radius = _pick_vector(world.centers, row), _pick(world.radii, row)
-        _, depth, edges = sphere_depth(ray, footprint, center, radius)
-        reach = radius * jnp.sqrt(jnp.maximum(depth + 0.5 * box_width(edges), 0.0))
-        scale = _pick(tables.paint.scale, jnp.maximum(row - plan.balls, 0))
-        ball = (surface >= plan.balls) & (surface < plan.first_plane)
-        flat = ball & (depth <= 0) & (reach * scale > 0.5)
-    if plan.matte_planes + plan.metal_planes:
-        plane = _plane_row(surface, plan)
-        normal = _pick_vector(world.normals, plane)
-        height = (ray.origin - _pick_vector(world.points, plane)).dot(normal)
-        downward = ray.direction.dot(normal) * jnp.where(height < 0, 1.0, -1.0)
-        on_plane = (surface >= plan.first_plane) & (surface < plan.first_lamp)
-        flat = flat | (on_plane & (downward <= 0))
-    return flat & ~pointed
+        flat = matte | screen
+        depth, edges = choose(flat, (cosine, (across, down)), (depth, edges))
+        outlined = outlined | flat
+    return outlined, depth, edges
 
 
 def _starts_outside(ray: Ray, center: Vec3, radius: Real) -> Array:
@@ -1505,11 +1492,11 @@ def _scatter(path: Path, setting: Setting) -> Scattered:
     )
 
 
-PARTS = 4
-"""Along each edge of a footprint: so many points of what scatters are met exactly. Far away, and at
-an outline, a footprint is far from straight there. Measured on two balls over matte grounds: 0.055
-and 0.086 off, with 2 parts 0.061 and 0.089; and before there were parts, with more noise, 0.13 and
-0.16."""
+ASIDE, UPWARD = 2, 8
+"""Along and towards an outline: so many parts of a footprint on what scatters are met exactly. Far
+away, and at an outline, a footprint is far from straight there. Measured with 256 samples on a ball
+over a chequered globe and over a plane from above: 0.040 and 0.044 off, with 4 by 8 parts 0.038 and
+0.045; with 4 by 4 that do not become denser towards the outline 0.060 over the globe."""
 
 
 def _albedo_for_now(path: Path, is_matte: Array, at_point: Channels, setting: Setting) -> Channels:
@@ -1538,37 +1525,82 @@ def _mean_color(surface: Array, tables: Tables, plan: Plan) -> Channels:
     return tuple(_pick(mean, row) for mean in tables.paint.mean)
 
 
-def _painted_at(path: Path, setting: Setting) -> Channels:
-    """The mean of a texture over the path's footprint."""
+def _painted_at(path: Path, setting: Setting, stiff: bool = False) -> Channels:
+    """The mean of a texture over the path's footprint.
+
+    Args:
+        path: the path.
+        setting: the rest.
+        stiff: whether the derivative knows how the footprint moves alone, not how it grows. What a
+            border of tiles that moves counts is even over a part of the film, however unevenly that
+            part lies on the surface.
+    """
     plan, tables, surface = setting.plan, setting.tables, path.surface
 
     def beneath(ray: Ray) -> Vec3:
         point, outward, _ = _meet(path._replace(ray=ray), setting)
         return _beneath(point, outward, surface, tables, plan)
 
+    def carried(ray: Ray) -> Vec3:
+        return beneath(ray) + (here - jax.lax.stop_gradient(here))
+
     met, edges = path.ray, path.footprint
-    return painted(surface, path, beneath, met, edges, tables, plan, False, setting.one)
+    if not stiff:
+        return painted(surface, path, beneath, met, edges, tables, plan, False, setting.one)
+    here = beneath(met)
+    met, edges = jax.lax.stop_gradient((met, edges))
+    return painted(surface, path, carried, met, edges, tables, plan, False, setting.one)
 
 
 def _mean_albedo(path: Path, setting: Setting) -> Channels:
-    """What part of the light a surface that scatters sends on, its mean over a footprint."""
+    """What part of the light a surface that scatters sends on, its mean over a footprint.
+
+    Towards the outline of a sphere a footprint reaches ever further over it, as the root of the
+    depth to which a line goes into the sphere, and on a plane still faster. So the parts are even
+    in that root: there each is as straight as the others. What lies beyond does not count.
+    """
     assert path.footprint is not None
-    footprint = path.footprint
-    small = path._replace(footprint=jax.tree.map(lambda edge: edge * (1.0 / PARTS), footprint))
-    if path.stretch is not None:
-        first, second = path.stretch
-        small = small._replace(stretch=(first * (1.0 / PARTS), second * (1.0 / PARTS)))
-    means = _mean_color(path.surface, setting.tables, setting.plan)
-    middles = ((np.arange(PARTS) + 0.5) / PARTS - 0.5).astype(setting.plan.dtype)
+    plan, tables = setting.plan, setting.tables
+    means, one = _mean_color(path.surface, tables, plan), jnp.ones_like(path.ray.origin.x)
+    outlined, *met = _outline_met(path.surface, path.ray, path.footprint, tables.world, plan)
+    depth, changes = choose(outlined, tuple(met), (one, (0.0 * one, 0.0 * one)))
+    edges = tuple(zip(path.footprint, path.stretch or changes, changes, strict=True))
+    swap = jnp.abs(changes[0]) > jnp.abs(changes[1])
+    upward, aside = choose(swap, edges, edges[::-1])
+    upward = jax.tree.map(lambda leaf: jnp.where(upward[2] < 0, -leaf, leaf), upward)
+    rise = jnp.where(upward[2] > 0, upward[2], 1.0)
 
-    def part(x: Real, y: Real) -> Channels:
-        ray = jax.tree.map(lambda r, a, d: r + x * a + y * d, path.ray, *footprint)
-        seen = small._replace(ray=ray)
-        flat = _seen_flat(seen, setting.tables, setting.plan)
-        return choose(flat, means, _painted_at(seen, setting))
+    def part(across: Real, begin: Real) -> tuple[Real, Channels]:
+        """The size of a part, and what it sends on."""
+        middle = depth + across * aside[2]
+        low, high = middle - 0.5 * upward[2], middle + 0.5 * upward[2]
+        meets = jnp.where(low < 0, jnp.clip(high / rise, 0.0, 1.0), 1.0)
+        # Where one part ends and the next begins may stay: only the outline moves.
+        low, high, still = jax.lax.stop_gradient((low, high, meets))
+        near, far = jnp.sqrt(jnp.maximum(low, 0.0)), jnp.sqrt(jnp.maximum(high, 0.0))
+        both, share = jnp.where(near + far > 0, near + far, 1.0), begin + 0.5 / UPWARD
+        root = near + (far - near) * share
+        length = 2.0 / UPWARD * still * root / both
+        place = 0.5 - still + still * share * (root + near) / both
+        small, smaller = aside[:2], upward[:2]
+        ray = jax.tree.map(
+            lambda r, a, u: r + across * a + place * u, path.ray, small[0], smaller[0]
+        )
+        small = jax.tree.map(lambda a: a * (1.0 / ASIDE), small)
+        smaller = jax.tree.map(lambda u: u * length, smaller)
+        seen = path._replace(ray=ray, footprint=(small[0], smaller[0]))
+        if path.stretch is not None:
+            seen = seen._replace(stretch=(small[1], smaller[1]))
+        shown = _painted_at(seen, setting, stiff=True)
+        return length + jnp.where(begin == 0, meets - still, 0.0), shown
 
-    across, down = (grid.ravel() for grid in np.meshgrid(middles, middles))
-    return tuple(jnp.mean(channel, axis=0) for channel in jax.vmap(part)(across, down))
+    middles = ((np.arange(ASIDE) + 0.5) / ASIDE - 0.5).astype(plan.dtype)
+    grids = np.meshgrid(middles, (np.arange(UPWARD) / UPWARD).astype(plan.dtype))
+    sizes, shown = jax.vmap(part)(*(grid.ravel() for grid in grids))
+    total = jnp.sum(sizes)
+    share = jnp.where(total > 0, sizes / jnp.where(total > 0, total, 1.0), 1.0 / (ASIDE * UPWARD))
+    mixed = (jnp.sum(share * channel, axis=0) for channel in shown)
+    return tuple(jnp.where(total > 0, m, mean) for m, mean in zip(mixed, means, strict=True))
 
 
 def _shown(path: Path, setting: Setting) -> Path:
