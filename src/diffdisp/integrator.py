@@ -1251,7 +1251,10 @@ ball over a chequered plane from above: 0.036 off in the mean; with three of the
 
 
 def _scattered_footprint(path: Path, setting: Setting) -> tuple[Scattered, tuple[Ray, Ray]]:
-    """What the surface that a path meets does to it, and to its footprint: matte ones end it."""
+    """What a surface does to the path that meets it, and to its footprint.
+
+    What scatters ends the footprint, and so do many bounces.
+    """
 
     def of(ray: Ray) -> tuple[Ray, Scattered]:
         scattered = _scatter(path._replace(ray=ray), setting)
@@ -1262,9 +1265,9 @@ def _scattered_footprint(path: Path, setting: Setting) -> tuple[Scattered, tuple
     spread = scattered.matte
     if setting.plan.fuzzy:
         spread = path.surface >= setting.plan.balls
+    ends = spread | (path.bounces >= FILTERED_BOUNCES)
     none = jax.tree.map(jnp.zeros_like, path.ray)
-    spread = spread | (path.bounces >= FILTERED_BOUNCES)
-    across, down = (choose(spread, none, push(edge)) for edge in path.footprint)
+    across, down = (choose(ends, none, push(edge)) for edge in path.footprint)
     return scattered, (across, down)
 
 
@@ -1573,6 +1576,7 @@ def _mean_albedo(path: Path, setting: Setting) -> Channels:
     means, one = _mean_color(path.surface, tables, plan), jnp.ones_like(path.ray.origin.x)
     outlined, *met = _outline_met(path.surface, path.ray, path.footprint, tables.world, plan)
     depth, changes = choose(outlined, tuple(met), (one, (0.0 * one, 0.0 * one)))
+    # Without tiles there is no stretch, and what stands in its place is not looked at.
     edges = tuple(zip(path.footprint, path.stretch or changes, changes, strict=True))
     swap = jnp.abs(changes[0]) > jnp.abs(changes[1])
     upward, aside = choose(swap, edges, edges[::-1])
@@ -1591,15 +1595,14 @@ def _mean_albedo(path: Path, setting: Setting) -> Channels:
         root = near + (far - near) * share
         length = 2.0 / UPWARD * still * root / both
         place = 0.5 - still + still * share * (root + near) / both
-        small, smaller = aside[:2], upward[:2]
         ray = jax.tree.map(
-            lambda r, a, u: r + across * a + place * u, path.ray, small[0], smaller[0]
+            lambda r, a, u: r + across * a + place * u, path.ray, aside[0], upward[0]
         )
-        small = jax.tree.map(lambda a: a * (1.0 / ASIDE), small)
-        smaller = jax.tree.map(lambda u: u * length, smaller)
-        seen = path._replace(ray=ray, footprint=(small[0], smaller[0]))
+        narrow = jax.tree.map(lambda a: a * (1.0 / ASIDE), aside[:2])
+        short = jax.tree.map(lambda u: u * length, upward[:2])
+        seen = path._replace(ray=ray, footprint=(narrow[0], short[0]))
         if path.stretch is not None:
-            seen = seen._replace(stretch=(small[1], smaller[1]))
+            seen = seen._replace(stretch=(narrow[1], short[1]))
         shown = _painted_at(seen, setting, stiff=True)
         return length + jnp.where(begin == 0, meets - still, 0.0), shown
 
@@ -1607,7 +1610,7 @@ def _mean_albedo(path: Path, setting: Setting) -> Channels:
     grids = np.meshgrid(middles, (np.arange(UPWARD) / UPWARD).astype(plan.dtype))
     sizes, shown = jax.vmap(part)(*(grid.ravel() for grid in grids))
     total = jnp.sum(sizes)
-    share = jnp.where(total > 0, sizes / jnp.where(total > 0, total, 1.0), 1.0 / (ASIDE * UPWARD))
+    share = sizes / jnp.where(total > 0, total, 1.0)
     mixed = (jnp.sum(share * channel, axis=0) for channel in shown)
     return tuple(jnp.where(total > 0, m, mean) for m, mean in zip(mixed, means, strict=True))
 
