@@ -16,14 +16,16 @@ import argparse
 import statistics
 import time
 from collections.abc import Callable
+from datetime import date
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from record import ROOT, print_table, write_record
+from record import ROOT, print_table, recorded, write_record
 
 from diffdisp import (
+    COMPILER_OPTIONS,
     Background,
     Camera,
     Checker,
@@ -325,7 +327,10 @@ def scattered(samples: list[int]) -> list[dict[str, Any]]:
 
 
 def cost_functions(scene: Scene) -> tuple[dict[str, Callable[[Any], Any]], jax.Array]:
-    """Forward render, six columns and gradient, jitted; and the coefficients (6,) they take."""
+    """Forward render, six columns and gradient, jitted; and the coefficients (6,) they take.
+
+    And the forward render once more, as XLA compiles it if it is told nothing.
+    """
     film = Film(64, 64, band_middles(400, 700, 8))
 
     def picture(coefficients: jax.Array) -> jax.Array:
@@ -339,7 +344,11 @@ def cost_functions(scene: Scene) -> tuple[dict[str, Callable[[Any], Any]], jax.A
     }
     glass = scene.objects[BALL].material.glass
     start = jnp.asarray(np.concatenate([glass.B, glass.C]))
-    return {name: jax.jit(function) for name, function in functions.items()}, start
+    jitted = {
+        name: jax.jit(function, compiler_options=COMPILER_OPTIONS)
+        for name, function in functions.items()
+    }
+    return {**jitted, "forward, no options": jax.jit(picture)}, start
 
 
 def timed(function: Callable[[Any], Any], argument: Any) -> tuple[float, float]:
@@ -368,6 +377,9 @@ def cost(scene: Scene, runs: int) -> list[dict[str, Any]]:
     return rows
 
 
+PARTS = ("cost", "accuracy", "outline", "scattered")
+
+
 def main() -> None:
     """Measure, print, record."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -380,16 +392,23 @@ def main() -> None:
     parser.add_argument("--h", type=float, default=1e-6, help="step in n of the render")
     parser.add_argument("--scattered", type=int, nargs="+", default=[256, 1024], help="samples")
     parser.add_argument("--runs", type=int, default=7, help="warm ones, for the median")
+    parser.add_argument("--only", nargs="+", choices=PARTS, help="and keep the rest of the record")
     options = parser.parse_args()
     scene = load_scene(str(BENCH))
-    figures: dict[str, Any] = {}
-    for dtype in ("float32", "float64"):
-        with jax.enable_x64(dtype == "float64"):
-            figures[f"cost_{dtype}"] = cost(scene, options.runs)
-    with jax.enable_x64(True):
-        figures |= accuracy(scene, options)
-        figures["outline"] = outline(options)
-        figures["scattered"] = scattered(options.scattered)
+    figures: dict[str, Any] = recorded("derivative") if options.only else {}
+    for part in options.only or PARTS:
+        if part == "cost":
+            for dtype in ("float32", "float64"):
+                with jax.enable_x64(dtype == "float64"):
+                    figures[f"cost_{dtype}"] = cost(scene, options.runs)
+        with jax.enable_x64(True):
+            if part == "accuracy":
+                figures |= accuracy(scene, options)
+            elif part == "outline":
+                figures["outline"] = outline(options)
+            elif part == "scattered":
+                figures["scattered"] = scattered(options.scattered)
+        figures["measured"] = {**figures.get("measured", {}), part: str(date.today())}
     for dtype in ("float32", "float64"):
         head = (dtype, "wall s", "CPU s", "wall ratio", "CPU ratio", "first s")
         print_table(head, [list(row.values()) for row in figures[f"cost_{dtype}"]])

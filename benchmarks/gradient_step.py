@@ -21,6 +21,7 @@ import numpy as np
 from record import print_table, write_record
 
 from diffdisp import (
+    COMPILER_OPTIONS,
     Camera,
     Checker2D,
     Dielectric,
@@ -69,7 +70,10 @@ def ours(size: int, counts: list[int]) -> tuple[list[Step], float]:
     losses = [float(np.mean((np.asarray(seen, float) - target) ** 2)) for seen in moved]
 
     def step(samples: int) -> Step:
-        gradient = jax.jit(jax.grad(lambda n: jnp.mean((picture(n, samples) - target) ** 2)))
+        gradient = jax.jit(
+            jax.grad(lambda n: jnp.mean((picture(n, samples) - target) ** 2)),
+            compiler_options=COMPILER_OPTIONS,
+        )
         return lambda _: float(gradient(jnp.asarray(INDEX)))
 
     return [step(samples) for samples in counts], (losses[0] - losses[1]) / (2 * STEP)

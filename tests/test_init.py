@@ -1,4 +1,5 @@
 import ast
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -23,8 +24,7 @@ def typed_imports() -> list[tuple[str, str]]:
 @pytest.mark.parametrize("name", diffdisp.__all__)
 def test_every_public_name_resolves(name):
     value = getattr(diffdisp, name)
-    assert callable(value)
-    assert value.__name__ == name
+    assert value.__name__ == name if callable(value) else name.isupper()
     assert vars(diffdisp)[name] is value  # the second look-up is an ordinary one
 
 
@@ -65,3 +65,25 @@ def test_import_and_help_load_nothing_heavy(statement):
     )
     assert done.stderr == ""
     assert done.stdout.splitlines()[-1] == "[]"
+
+
+OURS = "xla_backend_extra_options=xla_cpu_disable_tiled_emitter"
+
+
+@pytest.mark.parametrize(
+    ("flags", "kept"),
+    [
+        (None, f"--{OURS}"),
+        ("--xla_cpu_enable_fast_math=false", f"--xla_cpu_enable_fast_math=false --{OURS}"),
+        ("--xla_backend_extra_options=x", "--xla_backend_extra_options=x"),
+    ],
+)
+def test_xla_is_told_how_to_write_loops_by_who_asks_first(flags, kept):
+    surroundings = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    if flags is not None:
+        surroundings["XLA_FLAGS"] = flags
+    check = "import diffdisp, os; print(os.environ['XLA_FLAGS'])"
+    done = subprocess.run(
+        [sys.executable, "-c", check], capture_output=True, text=True, env=surroundings
+    )
+    assert done.stdout.strip() == kept

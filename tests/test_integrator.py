@@ -16,7 +16,7 @@ from diffdisp.geometry import Ray
 from diffdisp.glasses import named_glass
 from diffdisp.integrator import Path, Setting, Tables, bounce, once, paint_table, world_tables
 from diffdisp.planning import Plan, make_plan
-from diffdisp.programs import OPTIONS, QUICK
+from diffdisp.programs import COMPILER_OPTIONS, QUICK
 from diffdisp.scene import Scene
 from diffdisp.scene_file import load_scene
 from diffdisp.vector import Vec3, vec3
@@ -285,7 +285,7 @@ def test_once_is_the_stage_itself():
 
 
 @pytest.mark.parametrize("one", [None, jnp.array(1, jnp.int32)], ids=["barrier", "branch"])
-@pytest.mark.parametrize("options", [OPTIONS, QUICK], ids=["options", "quick"])
+@pytest.mark.parametrize("options", [COMPILER_OPTIONS, QUICK], ids=["options", "quick"])
 def test_what_is_computed_once_is_not_fused_with_its_users(one, options):
     def staged(x, one):
         return jnp.cos(once(lambda: jnp.sin(x), one))

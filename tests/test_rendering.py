@@ -558,7 +558,7 @@ def test_the_picture_does_not_depend_on_chunks(length, monkeypatch):
 def test_the_picture_does_not_depend_on_which_paths_move_up(block, monkeypatch):
     scene = furnace(*SEPARATE["apart"], color=[0.1, 0.2, 0.3])
     whole = render(scene, BANDS, samples=4, depth=50)
-    monkeypatch.setattr(integrator, "BLOCK", block)
+    monkeypatch.setattr(integrator, "BLOCK_BYTES", 8 * block)
     jax.clear_caches()
     blocks = render(scene, BANDS, samples=4, depth=50)
     jax.clear_caches()

@@ -4,7 +4,17 @@ import numpy as np
 import pytest
 from helpers import numbers
 
-from diffdisp.vector import Vec3, choose, least_square, normalize, safe_sqrt, vec3
+from diffdisp.vector import (
+    Vec3,
+    choose,
+    inverse,
+    inverse_root,
+    least_square,
+    normalize,
+    root,
+    safe_sqrt,
+    vec3,
+)
 
 RNG = np.random.default_rng(0)
 PAIRS = RNG.normal(size=(5, 2, 3))
@@ -44,6 +54,33 @@ def test_a_normalized_vector_has_length_one(length):
 
 def test_the_zero_vector_has_no_direction():
     assert np.isnan(numbers(normalize(vec3(jnp.zeros(3))))).all()
+
+
+POWERS = [(inverse, -1.0), (root, 0.5), (inverse_root, -0.5)]
+
+
+@pytest.mark.parametrize("order", range(4))
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize(("power_of", "power"), POWERS)
+def test_powers_have_all_their_derivatives(power_of, power, mode, order):
+    x = np.array([1e-3, 0.7, 40.0])
+    slope = power_of
+    for _ in range(order):
+        slope = mode(slope)
+    # d/dx of x^p is p x^(p - 1): a dozen products at most, each rounded once.
+    true = np.prod(power - np.arange(order)) * x ** (power - order)
+    np.testing.assert_allclose(jax.vmap(slope)(x), true, rtol=16 * EPS)
+
+
+@pytest.mark.parametrize(("power_of", "power"), POWERS)
+def test_a_power_and_its_derivatives_divide_once(power_of, power):
+    def slopes(x):
+        along = (jnp.ones_like(x),)
+        return jax.jvp(lambda x: jax.jvp(power_of, (x,), along), (x,), along)
+
+    compiled = jax.jit(slopes).lower(jnp.array(3.0)).compile().as_text()
+    assert compiled.count(" divide(") == 1
+    assert compiled.count(" sqrt(") == (0 if power == -1 else 1)
 
 
 @pytest.mark.parametrize(

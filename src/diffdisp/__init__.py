@@ -5,6 +5,7 @@ takes 0.8 s.
 """
 
 import importlib
+import os
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from diffdisp.image import Picture, linear_rgb, read_picture, write_picture
     from diffdisp.material import Dielectric, Emitter, Lambertian, Metal
     from diffdisp.planning import Plan, make_plan
+    from diffdisp.programs import COMPILER_OPTIONS
     from diffdisp.rendering import render
     from diffdisp.report import result_table, write_fit_json, write_report
     from diffdisp.scene import Background, Object, Scene, with_glass
@@ -33,6 +35,7 @@ if TYPE_CHECKING:
     from diffdisp.texture import Checker, Checker2D, Solid
 
 __all__ = [
+    "COMPILER_OPTIONS",
     "Background",
     "Camera",
     "Checker",
@@ -78,6 +81,22 @@ __all__ = [
     "write_report",
 ]
 
+
+def _as_other_loops() -> None:
+    """Have XLA write loops of sums and products as it writes all others.
+
+    In float64 it writes each vector to the stack in two halves and reads it back whole, for which
+    the processor waits: programs take a third longer. XLA takes this choice from the environment
+    alone, when the first program is compiled. Who chooses there what XLA is to do keeps the choice.
+    """
+    flags = os.environ.get("XLA_FLAGS", "")
+    if "xla_backend_extra_options" not in flags:
+        ours = "--xla_backend_extra_options=xla_cpu_disable_tiled_emitter"
+        os.environ["XLA_FLAGS"] = f"{flags} {ours}".strip()
+
+
+_as_other_loops()
+
 _NAMES = {
     "camera": ("Camera",),
     "color": ("encode_srgb",),
@@ -97,6 +116,7 @@ _NAMES = {
     "image": ("Picture", "linear_rgb", "read_picture", "write_picture"),
     "material": ("Dielectric", "Emitter", "Lambertian", "Metal"),
     "planning": ("Plan", "make_plan"),
+    "programs": ("COMPILER_OPTIONS",),
     "rendering": ("render",),
     "report": ("result_table", "write_fit_json", "write_report"),
     "scene": ("Background", "Object", "Scene", "with_glass"),

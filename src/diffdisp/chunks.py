@@ -18,7 +18,7 @@ from diffdisp.dispersion import domain_error
 from diffdisp.film import Film
 from diffdisp.integrator import Lanes, Paint, lane_radiance, paint_table, world_tables
 from diffdisp.planning import Plan
-from diffdisp.programs import OPTIONS
+from diffdisp.programs import COMPILER_OPTIONS
 from diffdisp.sampling import Numbers, footprints, sample_grid
 from diffdisp.scene import Scene, is_glass, object_glass
 from diffdisp.vector import Array, Real, module_of
@@ -480,4 +480,4 @@ def in_dtype(tree: Any, dtype: str) -> Any:
     return jax.tree.map(cast, tree)
 
 
-render_chunks_jit = jax.jit(render_chunks, static_argnums=0, compiler_options=OPTIONS)
+render_chunks_jit = jax.jit(render_chunks, static_argnums=0, compiler_options=COMPILER_OPTIONS)

@@ -50,7 +50,7 @@ from diffdisp.linearised import Columns, Eliminated, Linearised, linearise
 from diffdisp.misfit import Clipped, Robust
 from diffdisp.parameters import Parameter, Place, named_parameters, value_at, with_coordinates
 from diffdisp.planning import Plan, make_plan
-from diffdisp.programs import OPTIONS
+from diffdisp.programs import COMPILER_OPTIONS
 from diffdisp.scene import Scene, is_glass, object_glass, with_glass, without_names
 from diffdisp.vector import Array, Real
 
@@ -997,7 +997,7 @@ def _traced(
     return each_chunk(chunk, chunks)
 
 
-_traced_jit = jax.jit(_traced, static_argnums=(0, 1, 2), compiler_options=OPTIONS)
+_traced_jit = jax.jit(_traced, static_argnums=(0, 1, 2), compiler_options=COMPILER_OPTIONS)
 
 
 def _trace(
@@ -1598,7 +1598,7 @@ def _index_table(problem: Problem, level: Level) -> np.ndarray:
     return np.moveaxis(values.reshape(-1, len(INDEX_GRID), 3)[place], 1, 0)
 
 
-@partial(jax.jit, static_argnums=(0, 1), compiler_options=OPTIONS)
+@partial(jax.jit, static_argnums=(0, 1), compiler_options=COMPILER_OPTIONS)
 def _traced_at_indices(
     plan: Plan,
     ball: int,

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from diffdisp.vector import Real, least_square, safe_sqrt
+from diffdisp.vector import Real, inverse, least_square, safe_sqrt
 
 
 def reflection(cos_i: Real) -> tuple[Real, Real]:
@@ -25,7 +25,8 @@ def cos_transmitted(cos_i: Real, eta: Real) -> Real:
         eta: index behind the surface over index before it.
     """
     # (η - 1)(η + 1) keeps what η² - 1 would cancel where the two media are nearly the same.
-    return safe_sqrt((eta - 1.0) * (eta + 1.0) + cos_i * cos_i, least_square(cos_i)) / eta
+    root = safe_sqrt((eta - 1.0) * (eta + 1.0) + cos_i * cos_i, least_square(cos_i))
+    return root * inverse(eta)
 
 
 def refraction(cos_i: Real, cos_t: Real, eta: Real) -> tuple[Real, Real]:
@@ -36,7 +37,8 @@ def refraction(cos_i: Real, cos_t: Real, eta: Real) -> tuple[Real, Real]:
         cos_t: `cos_transmitted(cos_i, eta)`.
         eta: index behind the surface over index before it.
     """
-    return 1.0 / eta, cos_i / eta - cos_t
+    slower = inverse(eta)
+    return slower, cos_i * slower - cos_t
 
 
 def fresnel_reflectance(cos_i: Real, cos_t: Real, eta: Real) -> Real:
@@ -56,6 +58,6 @@ def fresnel_reflectance(cos_i: Real, cos_t: Real, eta: Real) -> Real:
     # Both denominators vanish together only where cos_i = cos_t = 0: the guard keeps the
     # quotient finite there, and R = 1 is then chosen.
     total = cos_t <= 0
-    s = (cos_i - eta * cos_t) / jnp.where(total, 1.0, cos_i + eta * cos_t)
-    p = (eta * cos_i - cos_t) / jnp.where(total, 1.0, eta * cos_i + cos_t)
+    s = (cos_i - eta * cos_t) * inverse(jnp.where(total, 1.0, cos_i + eta * cos_t))
+    p = (eta * cos_i - cos_t) * inverse(jnp.where(total, 1.0, eta * cos_i + cos_t))
     return jnp.where(total, 1.0, 0.5 * (s * s + p * p))

@@ -6,7 +6,18 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from diffdisp.dispersion import real_array
-from diffdisp.vector import Array, Real, Triple, Vec3, choose, least_square, normalize, safe_sqrt
+from diffdisp.vector import (
+    Array,
+    Real,
+    Triple,
+    Vec3,
+    choose,
+    inverse,
+    least_square,
+    normalize,
+    root,
+    safe_sqrt,
+)
 
 
 class Ray(NamedTuple):
@@ -43,10 +54,10 @@ def sphere_distances(ray: Ray, center: Vec3, radius: Real) -> tuple[Real, Real, 
     foot = to_origin + ray.direction * b
     discriminant = radius * radius - foot.dot(foot)
     least = least_square(b) * radius * radius
-    root = safe_sqrt(discriminant, least)
-    q = b + jnp.where(b < 0, -root, root)
+    half = safe_sqrt(discriminant, least)
+    q = b + jnp.where(b < 0, -half, half)
     product = to_origin.dot(to_origin) - radius * radius
-    other = product / jnp.where(q == 0, 1.0, q)
+    other = product * inverse(jnp.where(q == 0, 1.0, q))
     return jnp.minimum(q, other), jnp.maximum(q, other), discriminant > least
 
 
@@ -72,16 +83,16 @@ def first_distance(ray: Ray, center: Vec3, squared_radius: Real, on: Array) -> t
     discriminant = inside - foot.dot(foot)
     # A limit would be a number of the sphere alone, for which XLA makes a loop of its own.
     meets = discriminant * (1.0 / least_square(b)) > inside
-    root = jnp.where(meets, jnp.sqrt(jnp.where(meets, discriminant, 1.0)), 0.0)
+    half = jnp.where(meets, root(jnp.where(meets, discriminant, 1.0)), 0.0)
     product = squared - inside
     margin = (squared + inside) * (1e-13 if jnp.result_type(b) == jnp.float64 else 4e-7)
     product = jnp.where(on | (jnp.abs(product) <= margin), 0.0, product)
     # From outside the nearer root, from inside the farther one; each from the sum that does not
     # cancel, or from the product of both.
-    sum_ahead = b + root
+    sum_ahead = b + half
     divide = (product > 0) | (b < 0)
-    divisor = jnp.where(b < 0, b - root, sum_ahead)
-    quotient = product / jnp.where(divisor == 0, 1.0, divisor)
+    divisor = jnp.where(b < 0, b - half, sum_ahead)
+    quotient = product * inverse(jnp.where(divisor == 0, 1.0, divisor))
     distance = jnp.where(divide, quotient, sum_ahead)
     return distance, meets & (distance > 0)
 
@@ -106,10 +117,11 @@ def sphere_depth(
     to_origin = ray.origin - center
     along = -to_origin.dot(ray.direction)
     foot, squared = to_origin + ray.direction * along, radius * radius
+    scale = inverse(squared)
     across, down = (
-        -2.0 * foot.dot(edge.origin + edge.direction * along) / squared for edge in footprint
+        foot.dot(edge.origin + edge.direction * along) * (-2.0 * scale) for edge in footprint
     )
-    return along, (squared - foot.dot(foot)) / squared, (across, down)
+    return along, (squared - foot.dot(foot)) * scale, (across, down)
 
 
 def box_width(edges: tuple[Real, Real]) -> Real:
@@ -132,8 +144,8 @@ def mean_root(middle: Real, width: Real) -> Real:
     whole = middle > half
     total = jnp.where(high > 0, high + low, 1.0)
     # ∫√x as a difference of cubes over one of squares, without what both have in common.
-    inside = (high * high + high * low + low * low) * (2.0 / 3.0) / total
-    cut = high * high * high / (3.0 * jnp.where(whole | (half == 0), 1.0, half))
+    inside = (high * high + high * low + low * low) * (2.0 / 3.0) * inverse(total)
+    cut = high * high * high * (1.0 / 3.0) * inverse(jnp.where(whole | (half == 0), 1.0, half))
     return jnp.where(whole, inside, cut)
 
 
@@ -157,7 +169,8 @@ def soft_offset(ray: Ray, center: Vec3, radius: Real, width: Real, inside: Array
     to_origin = ray.origin - center
     along = -to_origin.dot(ray.direction)
     foot = to_origin + ray.direction * along
-    depth = (radius * radius - foot.dot(foot)) / (radius * radius)
+    squared = radius * radius
+    depth = (squared - foot.dot(foot)) * inverse(squared)
     met = foot - ray.direction * (radius * mean_root(depth, width))
     return choose(inside, to_origin + ray.direction * (2.0 * along), met)
 
@@ -166,7 +179,7 @@ def plane_distance(ray: Ray, point: Vec3, normal: Vec3) -> Real:
     """Distance along the ray to a plane; -1 where they are parallel."""
     cosine = ray.direction.dot(normal)
     parallel = cosine == 0
-    distance = (point - ray.origin).dot(normal) / jnp.where(parallel, 1.0, cosine)
+    distance = (point - ray.origin).dot(normal) * inverse(jnp.where(parallel, 1.0, cosine))
     return jnp.where(parallel, -1.0, distance)
 
 

@@ -25,11 +25,11 @@ from jax.experimental import serialize_executable
 
 from diffdisp.image import replacing
 
-OPTIONS = {
+COMPILER_OPTIONS = {
     "xla_cpu_prefer_vector_width": "512",
     "xla_disable_hlo_passes": "cpu-parallel-task-assigner,cse_barrier_expander",
 }
-"""Compiler options for our own programs.
+"""Compiler options for programs that trace paths: our own, and `jax.jit`'s of `render`.
 
 Wide vectors take a third less time where the processor has AVX-512. A kernel of a few microseconds
 is not shared out among threads: to wait for the other one would take several times as long, and
@@ -38,7 +38,7 @@ across them.
 """
 
 QUICK = {
-    **OPTIONS,
+    **COMPILER_OPTIONS,
     "xla_llvm_disable_expensive_passes": True,
     "xla_cpu_copy_insertion_use_region_analysis": True,
 }
@@ -48,6 +48,7 @@ A closer look at where loops need copies of what they carry saves many of large 
 """
 
 Program = Callable[..., jax.Array]
+
 
 _READY: dict[tuple[Any, ...], Program] = {}
 _LOCK = threading.Lock()

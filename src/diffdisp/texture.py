@@ -1,12 +1,12 @@
 """What a surface shows at a point, averaged over the footprint of a sample."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 
 from diffdisp.dispersion import real_array
-from diffdisp.vector import Real, Triple, choose
+from diffdisp.vector import Real, Triple, choose, inverse
 
 Pair = tuple[Real, Real]
 
@@ -69,10 +69,8 @@ def filtered_square_wave(x: Real, across: Real, down: Real) -> Real:
         The mean, within [-1, 1]; its derivatives are finite everywhere and continuous but where
         a footprint begins to touch a second edge.
     """
-    wide, narrow = _widths(across, down)
-    return jnp.where(
-        0.5 * (wide + narrow) <= 0.5, _near_edge(x, wide, narrow), _many_edges(x, wide, narrow)
-    )
+    boxes = _boxes(across, down)
+    return jnp.where(boxes.wide + boxes.narrow <= 1.0, _near_edge(x, boxes), _many_edges(x, boxes))
 
 
 def filtered_tiles(middle: Pair, across: Pair, down: Pair) -> Real:
@@ -111,30 +109,32 @@ def _around_corner(middle: Pair, across: Pair, down: Pair) -> Real:
     square, area = _dot(long, long), _cross(long, short)
     point = square <= 0
     size = jnp.where(point, 1.0, square)
-    wider = jnp.maximum(SLIVER - jnp.abs(area) / size, 0.0) * jnp.where(area < 0, -1.0, 1.0)
+    wider = jnp.maximum(SLIVER - jnp.abs(area) * inverse(size), 0.0)
+    wider = jnp.where(area < 0, -wider, wider)
     short = (short[0] - wider * long[1], short[1] + wider * long[0])
     area = jnp.where(point, 1.0, area + wider * square)
     mean, tilt = 0.0 * at[0], 0.0 * at[0]
     for edge, other in ((long, short), (short, long)):
+        x, y = (inverse(jnp.where(extent == 0, 1.0, extent)) for extent in edge)
         first, second = (
-            _product_along((at[0] + sign * other[0], at[1] + sign * other[1]), edge)
+            _product_along((at[0] + sign * other[0], at[1] + sign * other[1]), edge, (x, y))
             for sign in (-0.5, 0.5)
         )
         mean = mean + 0.25 * (first + second)
         turn = -1.0 if edge is short else 1.0
         tilt = tilt + turn * _cross(at, edge) * (first - second)
-    return even * (mean + 0.5 * tilt / area)
+    return even * (mean + 0.5 * tilt * inverse(area))
 
 
-def _product_along(middle: Pair, edge: Pair) -> Real:
+def _product_along(middle: Pair, edge: Pair, inverses: Pair) -> Real:
     """Mean of the product of both coordinates' signs along a line of some middle and extent."""
     signs, places = [], []
-    for x, extent in zip(middle, edge, strict=True):
+    for x, extent, slope in zip(middle, edge, inverses, strict=True):
         crosses = jnp.abs(x) < 0.5 * jnp.abs(extent)
         start = jnp.where(crosses, -extent, x)
         signs.append(jnp.where(start < 0, -1.0, 1.0))
         # What does not change its sign might as well do so at the very end.
-        places.append(jnp.where(crosses, -x / jnp.where(crosses, extent, 1.0), 0.5))
+        places.append(jnp.where(crosses, -x * slope, 0.5))
     return signs[0] * signs[1] * (1.0 - 2.0 * jnp.abs(places[0] - places[1]))
 
 
@@ -162,55 +162,66 @@ def covered(distance: Real, across: Real, down: Real) -> Real:
     Returns:
         The part, within [0, 1].
     """
-    return 0.5 + 0.5 * _filtered_sign(distance, *_widths(across, down))
+    return 0.5 + 0.5 * _filtered_sign(distance, _boxes(across, down))
 
 
-def _widths(across: Real, down: Real) -> tuple[Real, Real]:
-    """Widths of the wider and of the narrower of two boxes."""
-    wide = jnp.maximum(jnp.abs(across), jnp.abs(down))
-    return wide, jnp.maximum(jnp.minimum(jnp.abs(across), jnp.abs(down)), SLIVER * wide)
+class _Boxes(NamedTuple):
+    """Widths of the wider and of the narrower of two boxes, and one over each."""
+
+    wide: Real
+    narrow: Real
+    of_wide: Real
+    of_narrow: Real
 
 
-def _near_edge(x: Real, wide: Real, narrow: Real) -> Real:
+def _boxes(across: Real, down: Real) -> _Boxes:
+    """The boxes that the edges of a footprint are along one axis; a sliver counts as wider."""
+    across, down = jnp.abs(across), jnp.abs(down)
+    wide = jnp.maximum(across, down)
+    narrow = jnp.maximum(jnp.minimum(across, down), SLIVER * wide)
+    sharp = wide <= 0
+    of_wide, of_narrow = (inverse(jnp.where(sharp, 1.0, width)) for width in (wide, narrow))
+    return _Boxes(wide, narrow, of_wide, of_narrow)
+
+
+def _near_edge(x: Real, boxes: _Boxes) -> Real:
     """The filtered wave where the footprint meets one edge at most; exact in float32 too."""
     edge = jnp.round(x)
     rising = 1.0 - 2.0 * jnp.abs(edge - 2.0 * jnp.round(0.5 * edge))
-    return rising * _filtered_sign(x - edge, wide, narrow)
+    return rising * _filtered_sign(x - edge, boxes)
 
 
-def _filtered_sign(x: Real, wide: Real, narrow: Real) -> Real:
+def _filtered_sign(x: Real, boxes: _Boxes) -> Real:
     """Mean of the sign of x under two boxes convolved."""
+    wide, narrow, of_wide, of_narrow = boxes
     reach, flat, distance = 0.5 * (wide + narrow), 0.5 * (wide - narrow), jnp.abs(x)
-    sharp = wide <= 0
-    inner = 2.0 * distance / jnp.where(sharp, 1.0, wide)
+    inner = 2.0 * distance * of_wide
     short = jnp.maximum(reach - distance, 0.0)
-    outer = 1.0 - short * short / jnp.where(sharp, 1.0, wide * narrow)
-    mean = jnp.where(sharp | (distance >= reach), 1.0, jnp.where(distance <= flat, inner, outer))
+    outer = 1.0 - (short * of_wide) * (short * of_narrow)
+    mean = jnp.where(distance >= reach, 1.0, jnp.where(distance <= flat, inner, outer))
     return jnp.where(x < 0, -mean, mean)
 
 
-def _many_edges(x: Real, wide: Real, narrow: Real) -> Real:
+def _many_edges(x: Real, boxes: _Boxes) -> Real:
     """The filtered wave as a difference, over the wide box, of its integral under the narrow one.
 
     A second difference over both would cancel digits where the narrow box is a sliver.
     """
-    size = jnp.where(wide > 0, wide, 1.0)
-    return (_mean_ramp(x + 0.5 * wide, narrow) - _mean_ramp(x - 0.5 * wide, narrow)) / size
+    high, low = (_mean_ramp(x + sign * boxes.wide, boxes) for sign in (0.5, -0.5))
+    return (high - low) * boxes.of_wide
 
 
-def _mean_ramp(x: Real, width: Real) -> Real:
-    """Mean over a box of the integrated wave, which rises and falls between 0 and 1."""
-    small = width <= 1.0
-    half = 0.5 * jnp.where(small, width, 1.0)
+def _mean_ramp(x: Real, boxes: _Boxes) -> Real:
+    """Mean over the narrow box of the integrated wave, which rises and falls between 0 and 1."""
+    width = boxes.narrow
+    half = 0.5 * width
     kink = jnp.round(x)
     rising = 1.0 - 2.0 * jnp.abs(kink - 2.0 * jnp.round(0.5 * kink))
     distance = jnp.abs(x - kink)
-    near = distance < half
-    rounded = (distance * distance + half * half) / jnp.where(near, 2.0 * half, 1.0)
-    one_kink = rising * jnp.where(near, rounded, distance) + 0.5 * (1.0 - rising)
-    broad = jnp.where(small, 1.0, width)
-    difference = (_integrated(x + 0.5 * broad) - _integrated(x - 0.5 * broad)) / broad
-    return jnp.where(small, one_kink, difference + 0.5)
+    rounded = (distance * distance + half * half) * boxes.of_narrow
+    one_kink = rising * jnp.where(distance < half, rounded, distance) + 0.5 * (1.0 - rising)
+    difference = (_integrated(x + half) - _integrated(x - half)) * boxes.of_narrow
+    return jnp.where(width <= 1.0, one_kink, difference + 0.5)
 
 
 def _integrated(x: Real) -> Real:
