@@ -431,7 +431,8 @@ def main() -> None:
         "first s",
     )
     print_table(head, [list(row.values()) for row in figures["scattered"]])
-    write_record("derivative", vars(options), figures)
+    settings = {name: value for name, value in vars(options).items() if name != "only"}
+    write_record("derivative", settings, figures)
 
 
 if __name__ == "__main__":
