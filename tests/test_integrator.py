@@ -266,24 +266,7 @@ def test_the_last_order_ends_the_path():
     assert entered.alive
     ended = jax.jit(lambda path: shallow.bounce(path, N_D, inside=True))(entered)
     assert not ended.alive
-
-
-def test_within_its_ball_an_ended_path_stays_finite_and_collects_nothing():
-    shallow = tracer_bench(ball(N_D), depth=3)
-
-    def followed(index, turns):
-        path = shallow.bounce(path_at(0.5), index, inside=False)
-        return jax.lax.fori_loop(0, turns, lambda _, p: shallow.bounce(p, index, inside=True), path)
-
-    def with_slope(turns):
-        return jax.jit(lambda n: jax.jvp(lambda n: followed(n, turns), (n,), (jnp.ones(()),)))(N_D)
-
-    (ended, slope), (long_ended, long_slope) = with_slope(1), with_slope(500)
-    assert not long_ended.alive
-    for leaf in jax.tree.leaves((long_ended, long_slope)):
-        assert leaf.dtype == jax.dtypes.float0 or np.isfinite(leaf).all()
-    np.testing.assert_array_equal(long_ended.radiance, ended.radiance)
-    np.testing.assert_array_equal(long_slope.radiance, slope.radiance)
+    np.testing.assert_array_equal(numbers(ended.ray.origin), numbers(entered.ray.origin))
 
 
 def test_a_path_that_has_ended_collects_nothing():

@@ -1039,9 +1039,7 @@ def _both_ways(path: Path, setting: Setting, inside: Array | bool) -> Path:
         last=ball,
         throughput=(throughput * way.share,),
     )
-    # A path within its ball stays there, wherever it has ended: its numbers are finite.
-    frees = inside is True or not setting.differentiable
-    return _go_on(path, moved, goes_on, differ, radiance, setting, frees)
+    return _go_on(path, moved, goes_on, differ, radiance, setting)
 
 
 def _parting(path: Path, setting: Setting, inside: Array | bool) -> tuple[Way, Way, Array]:
@@ -1116,25 +1114,12 @@ def _parting(path: Path, setting: Setting, inside: Array | bool) -> tuple[Way, W
 
 
 def _go_on(
-    path: Path,
-    moved: Path,
-    goes_on: Array,
-    differ: Array,
-    radiance: Channels,
-    setting: Setting,
-    frees: bool,
+    path: Path, moved: Path, goes_on: Array, differ: Array, radiance: Channels, setting: Setting
 ) -> Path:
     """The moved path, ended unless it goes on.
 
-    Args:
-        path: as it came.
-        moved: as it would go on.
-        goes_on: whether it does.
-        differ: whether it met an interface.
-        radiance: with what it brought now.
-        setting: the rest.
-        frees: whether the numbers of an ended path may be any. Else they are those that it came
-            with, which are finite, as derivatives need them.
+    Where derivatives may be asked for an ended path is the old one, whose numbers are finite. Else
+    nobody reads them: only tables are looked up with them, within their bounds.
     """
     bounces = path.bounces + jnp.where(differ, 1, 0)
     # Colours have negative parts where a wavelength is outside what a screen can show.
@@ -1143,7 +1128,7 @@ def _go_on(
     alive = path.alive & goes_on & (brightest > setting.cutoff)
     alive = alive & (bounces < setting.plan.depth - 1)
     kept = moved._replace(bounces=bounces)
-    if not frees:
+    if setting.differentiable:
         kept = choose(alive, kept, path)
     return kept._replace(
         radiance=radiance,
@@ -1256,8 +1241,9 @@ def _one_way(path: Path, setting: Setting) -> Path:
         for r, t, x in zip(radiance, moved.throughput, light, strict=True)
     )
     goes_on = scattered.goes_on & (surface < plan.first_lamp)
-    moved, frees = moved._replace(surface=surface), not setting.differentiable
-    return _go_on(path, moved, goes_on, scattered.differ, radiance, setting, frees)
+    return _go_on(
+        path, moved._replace(surface=surface), goes_on, scattered.differ, radiance, setting
+    )
 
 
 FILTERED_BOUNCES = 5
@@ -2275,13 +2261,7 @@ def _bounded(enter: Step | None, advance: Step, paths: Path, plan: Plan) -> Path
     turns = (plan.depth - 1) * (2 * plan.balls if plan.nested else 1)
 
     def turn(paths: Path, _: None) -> tuple[Path, None]:
-        return _unless_done(still if enter is not None else step, paths), None
-
-    step = partial(advance, numbers)
-
-    def still(paths: Path) -> Path:
-        """A step within the only ball, of what has not ended: other numbers may be any."""
-        return choose(paths.alive, step(paths), paths)
+        return _unless_done(partial(advance, numbers), paths), None
 
     if enter is not None:
         paths = _unless_done(partial(enter, numbers), paths)
