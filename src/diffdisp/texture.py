@@ -115,9 +115,8 @@ def _around_corner(middle: Pair, across: Pair, down: Pair) -> Real:
     area = jnp.where(point, 1.0, area + wider * square)
     mean, tilt = 0.0 * at[0], 0.0 * at[0]
     for edge, other in ((long, short), (short, long)):
-        x, y = (inverse(jnp.where(extent == 0, 1.0, extent)) for extent in edge)
         first, second = (
-            _product_along((at[0] + sign * other[0], at[1] + sign * other[1]), edge, (x, y))
+            _product_along((at[0] + sign * other[0], at[1] + sign * other[1]), edge)
             for sign in (-0.5, 0.5)
         )
         mean = mean + 0.25 * (first + second)
@@ -126,15 +125,16 @@ def _around_corner(middle: Pair, across: Pair, down: Pair) -> Real:
     return even * (mean + 0.5 * tilt * inverse(area))
 
 
-def _product_along(middle: Pair, edge: Pair, inverses: Pair) -> Real:
+def _product_along(middle: Pair, edge: Pair) -> Real:
     """Mean of the product of both coordinates' signs along a line of some middle and extent."""
     signs, places = [], []
-    for x, extent, slope in zip(middle, edge, inverses, strict=True):
+    for x, extent in zip(middle, edge, strict=True):
         crosses = jnp.abs(x) < 0.5 * jnp.abs(extent)
         start = jnp.where(crosses, -extent, x)
         signs.append(jnp.where(start < 0, -1.0, 1.0))
         # What does not change its sign might as well do so at the very end.
-        places.append(jnp.where(crosses, -x * slope, 0.5))
+        # Divided by whether it does or not: both sides of a parallelogram share the quotient.
+        places.append(jnp.where(crosses, -x * inverse(jnp.where(extent == 0, 1.0, extent)), 0.5))
     return signs[0] * signs[1] * (1.0 - 2.0 * jnp.abs(places[0] - places[1]))
 
 
