@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 import diffdisp
+from diffdisp.programs import COMPILER_OPTIONS
 
 
 def typed_imports() -> list[tuple[str, str]]:
@@ -21,11 +22,20 @@ def typed_imports() -> list[tuple[str, str]]:
     ]
 
 
-@pytest.mark.parametrize("name", diffdisp.__all__)
+CONSTANTS = {"COMPILER_OPTIONS": COMPILER_OPTIONS}
+
+
+@pytest.mark.parametrize("name", sorted({*diffdisp.__all__} - {*CONSTANTS}))
 def test_every_public_name_resolves(name):
     value = getattr(diffdisp, name)
-    assert value.__name__ == name if callable(value) else name.isupper()
+    assert callable(value)
+    assert value.__name__ == name
     assert vars(diffdisp)[name] is value  # the second look-up is an ordinary one
+
+
+@pytest.mark.parametrize("name", CONSTANTS)
+def test_public_constants_are_those_of_their_modules(name):
+    assert getattr(diffdisp, name) is CONSTANTS[name]
 
 
 def test_type_checkers_see_the_same_names():

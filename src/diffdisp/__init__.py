@@ -82,7 +82,7 @@ __all__ = [
 ]
 
 
-def _as_other_loops() -> None:
+def _disable_tiled_emitter() -> None:
     """Have XLA write loops of sums and products as it writes all others.
 
     In float64 it writes each vector to the stack in two halves and reads it back whole, for which
@@ -95,7 +95,7 @@ def _as_other_loops() -> None:
         os.environ["XLA_FLAGS"] = f"{flags} {ours}".strip()
 
 
-_as_other_loops()
+_disable_tiled_emitter()
 
 _NAMES = {
     "camera": ("Camera",),
