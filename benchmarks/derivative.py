@@ -22,7 +22,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from record import ROOT, print_table, recorded, write_record
+from record import ROOT, machine, print_table, recorded, write_record
 
 from diffdisp import (
     COMPILER_OPTIONS,
@@ -397,18 +397,19 @@ def main() -> None:
     scene = load_scene(str(BENCH))
     figures: dict[str, Any] = recorded("derivative") if options.only else {}
     for part in options.only or PARTS:
-        if part == "cost":
-            for dtype in ("float32", "float64"):
-                with jax.enable_x64(dtype == "float64"):
-                    figures[f"cost_{dtype}"] = cost(scene, options.runs)
         with jax.enable_x64(True):
-            if part == "accuracy":
+            if part == "cost":
+                for dtype in ("float32", "float64"):
+                    with jax.enable_x64(dtype == "float64"):
+                        figures[f"cost_{dtype}"] = cost(scene, options.runs)
+            elif part == "accuracy":
                 figures |= accuracy(scene, options)
             elif part == "outline":
                 figures["outline"] = outline(options)
-            elif part == "scattered":
+            else:
                 figures["scattered"] = scattered(options.scattered)
-        figures["measured"] = {**figures.get("measured", {}), part: str(date.today())}
+        measured = {"date": str(date.today()), "cpu": machine()["cpu"]}
+        figures["measured"] = {**figures.get("measured", {}), part: measured}
     for dtype in ("float32", "float64"):
         head = (dtype, "wall s", "CPU s", "wall ratio", "CPU ratio", "first s")
         print_table(head, [list(row.values()) for row in figures[f"cost_{dtype}"]])
