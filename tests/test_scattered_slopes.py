@@ -76,6 +76,24 @@ def test_a_white_ball_before_white_is_not_seen():
     assert abs(np.mean(value(jnp.asarray(N))) - 1) < 1.2e-3
 
 
+def test_a_horizon_that_the_camera_sees():
+    # Black ground below a white sky: of a pixel the part above the horizon, which the camera's
+    # tilt moves, is white.
+    black, edge, tilt = ground(Lambertian([0.0] * 3), -1.0), np.tan(np.pi / 9), 0.15
+
+    def column(tilt):
+        target = jnp.stack([0.0 * tilt, tilt, -1.0 + 0.0 * tilt])
+        camera = Camera((0, 0, 0), target, vertical_fov=40.0)
+        seen = Scene(camera, (black,), Background(WHITE))
+        film = Film(8, 8, np.array([0.55]))
+        return jnp.mean(render(seen, film, samples=256, dtype="float64")[..., 0], axis=1)
+
+    found, slope = jax.jit(lambda tilt: jax.jvp(column, (tilt,), (1.0,)))(jnp.asarray(tilt))
+    horizon = 4 * (1 + tilt / edge)
+    assert np.asarray(found) == pytest.approx(np.clip(horizon - np.arange(8), 0, 1), abs=2e-3)
+    assert np.asarray(slope) == pytest.approx(4 / edge * (np.arange(8) == 5), rel=0.02, abs=1e-9)
+
+
 def test_cubes_near_a_horizon_seen_through_a_ball():
     # A row of pixels that each show four cubes and a horizon. The scene is its own mirror image
     # but for the colours of its cubes, so that the difference of both halves is of those alone.

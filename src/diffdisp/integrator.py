@@ -793,6 +793,7 @@ def start_path(
     film_point: tuple[Real, Real],
     cell: tuple[Real, Real],
     one: Array | None,
+    choices: Choices | None = None,
 ) -> Path:
     """The path from a film point to its first surface; ended, unless that one sends it on.
 
@@ -803,6 +804,7 @@ def start_path(
         film_point: pixels to the right of and below the picture's upper left corner.
         cell: width and height of the part of the film that the sample stands for, pixels.
         one: as in `once`.
+        choices: before any is made, of a path that makes some: of what an outline parts it sees one.
     """
 
     def through(x: Real, y: Real) -> Ray:
@@ -815,16 +817,30 @@ def start_path(
         ray, push = jax.linearize(through, *film_point)
         footprint = (push(zero + cell[0], zero), push(zero, zero + cell[1]))
     spheres = all_spheres(tables.world, plan, None)
-    surface = nearest(ray, tables.world, plan, no_surface(zero), spheres, footprint)
+    last = no_surface(zero)
+    if choices is None:
+        surface = nearest(ray, tables.world, plan, last, spheres, footprint)
+    else:
+        assert footprint is not None
+        surface, share, choices = _one_of_seen(
+            ray, footprint, last, choices, spheres, tables.world, plan
+        )
     path = new_path(ray, footprint, surface, plan)
     if footprint is not None and any(plan.tiled):
         # Off the middle of the picture a step of the film turns a ray the less.
         ahead = ray.direction.dot(projection.forward)
         turns = tuple(-edge.direction.dot(projection.forward) / ahead for edge in footprint)
         path = path._replace(stretch=(turns[0], turns[1]))
-    shown = arriving(surface, path, tables, plan, one)
     ends = surface >= plan.first_lamp
-    return path._replace(radiance=tuple(jnp.where(ends, channel, 0.0) for channel in shown))
+    if choices is None:
+        shown = arriving(surface, path, tables, plan, one)
+        return path._replace(radiance=tuple(jnp.where(ends, channel, 0.0) for channel in shown))
+    shown = emitted(surface, path, tables, plan, one)
+    radiance: Channels = tuple(jnp.where(ends, share * channel, 0.0) for channel in shown)
+    counts = jnp.ones(surface.shape, bool)
+    radiance = _against_chance(radiance, counts, path.throughput, share, tables, plan)
+    throughput = tuple(t * share for t in path.throughput)
+    return path._replace(throughput=throughput, radiance=radiance, choices=choices)
 
 
 def no_surface(like: Real) -> Array:
@@ -1216,7 +1232,7 @@ def _one_way(path: Path, setting: Setting) -> Path:
         radiance = tuple(r + x for r, x in zip(radiance, shown, strict=True))
     spheres = all_spheres(tables.world, plan, setting.one)
     if plan.filtered and scattered.share is not None:
-        radiance = _against_chance(radiance, counts, path.throughput, scattered.share, setting)
+        radiance = _against_chance(radiance, counts, path.throughput, scattered.share, tables, plan)
     if path.lit is not None:
         assert path.footprint is not None
         first = scattered.matte & ~_all_zero(path.footprint) & path.alive
@@ -1227,8 +1243,11 @@ def _one_way(path: Path, setting: Setting) -> Path:
     if footprint is None:
         surface = nearest(moved.ray, tables.world, plan, path.surface, spheres)
     else:
-        surface, share, choices = _one_of_seen(moved, spheres, setting)
-        radiance = _against_chance(radiance, counts, moved.throughput, share, setting)
+        assert moved.choices is not None
+        surface, share, choices = _one_of_seen(
+            moved.ray, footprint, path.surface, moved.choices, spheres, tables.world, plan
+        )
+        radiance = _against_chance(radiance, counts, moved.throughput, share, tables, plan)
         throughput = tuple(t * share for t in moved.throughput)
         moved = moved._replace(throughput=throughput, choices=choices)
     light = emitted(surface, moved, tables, plan, setting.one)
@@ -1275,7 +1294,15 @@ def _scattered_footprint(path: Path, setting: Setting) -> tuple[Scattered, tuple
     return scattered, (across, down)
 
 
-def _one_of_seen(moved: Path, spheres: Candidates, setting: Setting) -> tuple[Array, Real, Choices]:
+def _one_of_seen(
+    ray: Ray,
+    footprint: tuple[Ray, Ray],
+    last: Array,
+    choices: Choices,
+    spheres: Candidates,
+    world: World,
+    plan: Plan,
+) -> tuple[Array, Real, Choices]:
     """One of the surfaces that a footprint meets, what it counts, and the choices with this one.
 
     Across an outline, and the horizon of a plane, lie two: the nearer one is chosen by the part of
@@ -1283,21 +1310,22 @@ def _one_of_seen(moved: Path, spheres: Candidates, setting: Setting) -> tuple[Ar
     are hard.
 
     Args:
-        moved: the path, with the surface that it leaves as its last.
+        ray: the footprint's middle.
+        footprint: its edges.
+        last: number of the surface that it leaves.
+        choices: that have been made.
         spheres: those that it can meet.
-        setting: the rest.
+        world: the scene.
+        plan: its static choices.
     """
-    plan, world, ray, footprint = setting.plan, setting.tables.world, moved.ray, moved.footprint
-    assert footprint is not None
-    first = nearest(ray, world, plan, moved.last, spheres, footprint)
+    first = nearest(ray, world, plan, last, spheres, footprint)
     part = _part_met(first, ray, footprint, world, plan)
     # A small part changes by much of itself: it is chosen more often than it is large.
     certain = jax.lax.stop_gradient(part)
     chance = jnp.where(certain > 0, 0.5 * (1.0 + certain), 0.0)
-    assert moved.choices is not None
-    taken, made = moved.choices.made(chance)
-    choices = choose(_all_zero(footprint), moved.choices, made)
-    behind = nearest(ray, world, plan, moved.last, spheres, None, first)
+    taken, made = choices.made(chance)
+    choices = choose(_all_zero(footprint), choices, made)
+    behind = nearest(ray, world, plan, last, spheres, None, first)
     share = jnp.where(taken, part, 1.0 - part)
     counted = jnp.where(taken, chance, 1.0 - chance)
     share = share / jnp.where(counted > 0, counted, 1.0)
@@ -1305,14 +1333,18 @@ def _one_of_seen(moved: Path, spheres: Candidates, setting: Setting) -> tuple[Ar
 
 
 def _against_chance(
-    radiance: Channels, counts: Array, throughput: Channels, share: Real, setting: Setting
+    radiance: Channels,
+    counts: Array,
+    throughput: Channels,
+    share: Real,
+    tables: Tables,
+    plan: Plan,
 ) -> Channels:
     """The same radiance, with a derivative of less noise.
 
     Of ways that are chosen by chance, the derivatives of what each counts are 0 in the mean. Times
     the background's radiance, near to what is seen on one of them, they take most of the noise out.
     """
-    plan, tables = setting.plan, setting.tables
     background = plan.background - plan.balls + tables.first_row
     change = jnp.where(counts, share - jax.lax.stop_gradient(share), 0.0)
     return tuple(
@@ -2017,12 +2049,14 @@ def _radiance(plan: Plan, indices: tuple[Array, ...], lanes: Lanes, loop: Loop) 
     tables = Tables(lanes.world, lanes.paint._replace(mean=mean, half=half))
     first_rows = np.arange(waves, dtype=np.int32) * np.int32(rows)
 
-    def start(x: Real, y: Real, first_row: Array) -> Path:
-        seen = tables._replace(first_row=first_row)
-        return start_path(lanes.projection, seen, plan, (x, y), lanes.cell, lanes.one)
+    choices = _first_choices(lanes, plan) if plan.filtered else None
 
-    every = jax.vmap(jax.vmap(jax.vmap(start, (0, 0, None)), (0, 0, None)), (None, None, 0))
-    paths = every(lanes.x, lanes.y, first_rows)
+    def start(x: Real, y: Real, choices: Choices | None, first_row: Array) -> Path:
+        seen = tables._replace(first_row=first_row)
+        return start_path(lanes.projection, seen, plan, (x, y), lanes.cell, lanes.one, choices)
+
+    every = jax.vmap(jax.vmap(start, (0, 0, 0, None)), (0, 0, 0, None))
+    paths = jax.vmap(every, (None, None, None, 0))(lanes.x, lanes.y, choices, first_rows)
     if plan.scattering and lanes.weights is not None:
         # What a sample sees before it meets glass counts once, at its first wavelength.
         first = np.arange(lanes.weights.shape[0])[:, None, None] == 0
@@ -2092,8 +2126,6 @@ def _to_the_end(
     def every_path(inside: bool | None) -> Step:
         return jax.vmap(partial(advance, inside=inside))
 
-    if plan.filtered:
-        paths = paths._replace(choices=_first_choices(paths, numbers, starts, lanes))
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1), paths)
     if plan.scattering or plan.balls > 1 or plan.nested:
         ended = loop(None, every_path(None), flat, plan)
@@ -2111,14 +2143,15 @@ def _to_the_end(
     return _lit_alike(radiance, lit, choices)
 
 
-def _first_choices(paths: Path, numbers: Numbers, starts: Array, lanes: Lanes) -> Choices:
-    """Of paths (J, S, P): numbers that are even over the samples of each part of a pixel."""
+def _first_choices(lanes: Lanes, plan: Plan) -> Choices:
+    """Of paths (S, P): numbers that are even over the samples of each part of a pixel."""
+    numbers = Numbers(plan.numbers_per_bounce, lanes.seed, plan.dtype)
+    starts = numbers.start(lanes.pixel)
     together = lanes.sample.shape[0] // footprints(lanes.sample.shape[0])
     part, within = lanes.sample // together, lanes.sample % together
     by_pixel = jax.vmap(numbers.of_film, (0, None, None))
     shift = jax.vmap(by_pixel, (None, 0, None))(starts, part, 2)
     number = (within.astype(shift.dtype)[:, None] + shift) * (1.0 / together)
-    number = jnp.broadcast_to(number, paths.alive.shape)
     return Choices(number, jnp.ones_like(number), jnp.zeros(number.shape, jnp.int32))
 
 
