@@ -804,7 +804,8 @@ def start_path(
         film_point: pixels to the right of and below the picture's upper left corner.
         cell: width and height of the part of the film that the sample stands for, pixels.
         one: as in `once`.
-        choices: before any is made, of a path that makes some: of what an outline parts it sees one.
+        choices: of a path that makes some, before any is made: across an outline it sees one of
+            two surfaces.
     """
 
     def through(x: Real, y: Real) -> Ray:
