@@ -393,6 +393,16 @@ def test_cubes_on_what_shines(what, scattering):
     check_tiles(picture, even, 1e-14 if scattering else 1e-6)
 
 
+@pytest.mark.parametrize(("height", "expected"), [(3e-4, EVEN), (-3e-4, ODD)])
+def test_cubes_just_above_a_border(height, expected):
+    # In cubes' edges. What a level ground showed was once that of a thousandth beneath it, which
+    # moves the borders of a ground that is almost level by far more.
+    plane = ground(Emitter(CUBES), height * np.pi / 2)
+    view = Camera((0.8, 3, 0.8), (0.8, 0, 0.81), vertical_fov=10.0)
+    scene = Scene(view, (plane, matte(0.5, (0, -1000, 0))))
+    assert np.allclose(render(scene, FILM, samples=1, depth=2), expected)
+
+
 def test_a_lamp_with_cubes_lights_what_is_around_it():
     # An integrating sphere. Cubes of 0.08 on a lamp 0.8 large: half of those in view are even,
     # to a hundredth or so.

@@ -566,11 +566,11 @@ def _filtered_cubes(
 
 
 def _beneath(point: Vec3, outward: Vec3, surface: Array, tables: "Tables", plan: Plan) -> Vec3:
-    """A thousandth of a cube beneath a point of a surface, where it is certain in which cube."""
+    """So little beneath a point of a surface that it is certain in which cube: 1e-4 of its edge."""
     if not any(plan.cubed):
         return point
     scale = _pick(tables.paint.scale, jnp.maximum(surface - plan.balls, 0))
-    return point - outward * (1e-3 / jnp.where(scale > 0, scale, 1.0))
+    return point - outward * (1e-4 / jnp.where(scale > 0, scale, 1.0))
 
 
 def emitted(
