@@ -62,7 +62,7 @@ SCATTERED_SIZE, SCATTERED_STEP = 48, 1.25e-4
 """Of the pictures whose differences tell how the edges of a matte ground move, and the step: with
 one of 5e-4 images next to the rim move so far that the square of what such differences are off is
 0.001 of theirs, as much as the derivative's own."""
-SCATTERED_PARTS, SCATTERED_ENOUGH = 128, 0.01
+SCATTERED_PARTS, SCATTERED_ENOUGH = 256, 0.01
 """Of a pixel's edge, the finest; and the change of the differences below which that is enough."""
 PLASTIC = 1.32471795724474602596
 """Root of x³ = x + 1, for evenly spread points. Source: Roberts, The unreasonable effectiveness
