@@ -20,12 +20,12 @@ import numpy as np
 from diffdisp import Checker2D, Plane, Scene
 
 Vector = tuple[jax.Array, ...]
-"""Three numbers of each of many."""
+"""Two or three numbers of each of many."""
 Seen = Callable[[Any, jax.Array, Vector, Vector], Any]
 """From a sum, a weight, a ray's origin and its direction to the sum with what the ray sees."""
 
 ORDERS = 40
-"""Of the rays that a ball makes of one: what it has reflected more often is left out."""
+"""Internal reflections that are followed; what has had more is left out."""
 RADII, TURNS, ANGLES = 33, 16, 64
 """Where on the ground its light is known: distances from the ball's foot, the mean of directions;
 and angles each way of the rays to the ball that it is summed over."""
