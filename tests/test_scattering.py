@@ -403,6 +403,15 @@ def test_cubes_just_above_a_border(height, expected):
     assert np.allclose(render(scene, FILM, samples=1, depth=2), expected)
 
 
+@pytest.mark.parametrize("radius", [5e3, 2e4])
+def test_cubes_on_a_sphere_whose_points_are_rounded_by_more_than_their_depth(radius):
+    # In float32 its top, on a border of cubes, was once the cube above it, or speckled.
+    globe = Object(Sphere([0, -radius, 0], radius), Emitter(Checker(EVEN, ODD, 10.0)))
+    view = Camera((0.16, 3, 0.16), (0.16, 0, 0.161), vertical_fov=0.5)
+    shown = render(Scene(view, (globe,)), FILM, samples=1, depth=2, dtype="float32")
+    assert np.allclose(shown, ODD)
+
+
 def test_a_lamp_with_cubes_lights_what_is_around_it():
     # An integrating sphere. Cubes of 0.08 on a lamp 0.8 large: half of those in view are even,
     # to a hundredth or so.

@@ -566,11 +566,20 @@ def _filtered_cubes(
 
 
 def _beneath(point: Vec3, outward: Vec3, surface: Array, tables: "Tables", plan: Plan) -> Vec3:
-    """So little beneath a point of a surface that it is certain in which cube: 1e-4 of its edge."""
+    """So little beneath a point of a surface that it is certain in which cube.
+
+    That is 1e-4 of a cube's edge. Points of a sphere are rounded by its radius: beneath a large one
+    it is more.
+    """
     if not any(plan.cubed):
         return point
-    scale = _pick(tables.paint.scale, jnp.maximum(surface - plan.balls, 0))
-    return point - outward * (1e-4 / jnp.where(scale > 0, scale, 1.0))
+    world, scale = tables.world, _pick(tables.paint.scale, jnp.maximum(surface - plan.balls, 0))
+    depth = 1e-4 / jnp.where(scale > 0, scale, 1.0)
+    if plan.spheres > plan.balls:
+        row, is_sphere = _sphere_row(surface, plan)
+        rounding = float(np.finfo(plan.dtype).eps) * _pick(world.radii, row)
+        depth = jnp.where(is_sphere, jnp.maximum(depth, rounding), depth)
+    return point - outward * depth
 
 
 def emitted(
@@ -578,7 +587,7 @@ def emitted(
 ) -> Channels:
     """Radiance of the surface that ends a path."""
     world = tables.world
-    sphere = jnp.clip(surface - plan.first_lamp + plan.first_plane, 0, max(plan.spheres - 1, 0))
+    sphere, _ = _sphere_row(surface, plan)
     plane = _plane_row(surface, plan)
     on_lamp = (surface >= plan.first_lamp) & (surface < plan.first_lamp + plan.lamps)
     on_screen = (surface >= plan.first_lamp + plan.lamps) & (surface < plan.background)
@@ -754,6 +763,14 @@ def _screen_seen(row: int, path: Path, tables: "Tables", plan: Plan, one: Array 
 def _everywhere(number: int, like: Real) -> Array:
     """The number of one surface, in the shape of `like`."""
     return jnp.full(jnp.shape(like), number, jnp.int32)
+
+
+def _sphere_row(surface: Array, plan: Plan) -> tuple[Array, Array]:
+    """The row of the table of spheres in which a surface stands that is one, and whether it is."""
+    before_planes = surface < plan.first_plane
+    lamp = (surface >= plan.first_lamp) & (surface < plan.first_lamp + plan.lamps)
+    row = jnp.where(before_planes, surface, surface - plan.first_lamp + plan.first_plane)
+    return jnp.clip(row, 0, max(plan.spheres - 1, 0)), before_planes | lamp
 
 
 def _plane_row(surface: Array, plan: Plan) -> Array:
@@ -1376,14 +1393,11 @@ def _outline_met(
     edges: tuple[Real, Real] = (0.0 * depth, 0.0 * depth)
     outlined: Array = jnp.zeros(surface.shape, bool)
     if plan.spheres > plan.balls:
-        before_planes = surface < plan.first_plane
-        lamp = (surface >= plan.first_lamp) & (surface < plan.first_lamp + plan.lamps)
-        row = jnp.where(before_planes, surface, surface - plan.first_lamp + plan.first_plane)
-        row = jnp.clip(row, 0, plan.spheres - 1)
+        row, is_sphere = _sphere_row(surface, plan)
         center, radius = _pick_vector(world.centers, row), _pick(world.radii, row)
         _, depth, edges = sphere_depth(ray, footprint, center, radius)
         outside = _starts_outside(ray, center, radius)
-        outlined = jnp.asarray(((before_planes & (surface >= plan.balls)) | lamp) & outside)
+        outlined = jnp.asarray(is_sphere & (surface >= plan.balls) & outside)
     if plan.planes:
         plane = _plane_row(surface, plan)
         normal = _pick_vector(world.normals, plane)
