@@ -14,7 +14,16 @@ from diffdisp.film import Film
 from diffdisp.fresnel import cos_transmitted, fresnel_reflectance
 from diffdisp.geometry import Ray
 from diffdisp.glasses import named_glass
-from diffdisp.integrator import Path, Setting, Tables, bounce, once, paint_table, world_tables
+from diffdisp.integrator import (
+    Path,
+    Setting,
+    Tables,
+    bounce,
+    once,
+    paint_table,
+    through_ball,
+    world_tables,
+)
 from diffdisp.planning import Plan, make_plan
 from diffdisp.programs import COMPILER_OPTIONS, QUICK
 from diffdisp.scene import Scene
@@ -192,6 +201,44 @@ def test_angular_momentum_of_what_leaves(impact, order):
     assert caught == 1
     momentum = np.linalg.norm(np.cross(numbers(ray.origin), numbers(ray.direction)))
     np.testing.assert_allclose(momentum, impact, rtol=0, atol=1e-13)  # rounding
+
+
+ORIGIN = vec3(jnp.zeros(3))
+
+
+@pytest.mark.parametrize("impact", [1e-9, *IMPACTS])
+@pytest.mark.parametrize("order", [-1, 0, 1, 2, 3])
+def test_a_ball_in_one_step(impact, order):
+    expected, _ = leave(jnp.array(impact), jnp.array(N_D), order)
+    found, meets = through_ball(
+        path_at(impact).ray, ORIGIN, jnp.array(1.0), jnp.array(N_D), jnp.array(order + 2)
+    )
+    assert meets
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(numbers(one), numbers(other), rtol=0, atol=1e-12)
+
+
+def slope_in_the_place(ray, center):
+    """How the direction of what leaves the ball changes with all numbers of its centre."""
+
+    def leaving(change):
+        moved = Vec3(*(x + change for x in center))
+        return through_ball(ray, moved, jnp.array(1.0), jnp.array(N_D), jnp.array(2))[0]
+
+    return numbers(jax.jvp(leaving, (0.0,), (1.0,))[1].direction)
+
+
+def test_a_ball_in_one_step_has_a_slope_on_its_axis():
+    ray = path_at(0.0).ray
+    close = slope_in_the_place(path_at(1e-7).ray, ORIGIN)
+    np.testing.assert_allclose(slope_in_the_place(ray, ORIGIN), close, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("center", [(1.1, 0, 0), (0, 0, 9.0), (0, 0, 3.5)])
+def test_a_ball_that_is_not_met_from_outside_in_one_step(center):
+    ray, center = path_at(0.0).ray, vec3(jnp.array(center))
+    assert not through_ball(ray, center, jnp.array(1.0), jnp.array(N_D), jnp.array(2))[1]
+    assert np.isfinite(slope_in_the_place(ray, center)).all()
 
 
 @jax.jit
