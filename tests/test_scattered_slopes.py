@@ -68,6 +68,20 @@ def test_slopes_in_the_index(of, most):
     assert np.abs(value - hard).mean() < 0.01
 
 
+def test_a_horizon_on_the_axis_of_camera_and_ball():
+    # Exactly between two parts of a pixel: rounding alone tells whether a part's ray is level.
+    level = scene(Camera((0, 0, 4), (0, 0, 0), vertical_fov=42.0), TILES)
+    film = Film(15, 15, np.array([0.55]))
+
+    def seen(n):
+        of = with_glass(level, 0, glass(n))
+        return render(of, film, samples=16, dtype="float64")[..., 0]
+
+    value, slope = jax.jit(lambda n: jax.jvp(seen, (n,), (1.0,)))(jnp.asarray(N))
+    assert np.isfinite(value).all()
+    assert np.isfinite(slope).all()
+
+
 def test_a_white_ball_before_white_is_not_seen():
     # A footprint that grazes it scatters from its outside: from its inside half of them saw no
     # light, and the picture was 2e-3 too dark. The noise of its mean is 5e-4.

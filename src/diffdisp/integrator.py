@@ -785,9 +785,10 @@ def _plane_row(surface: Array, plan: Plan) -> Array:
 
 
 def _to_plane(ray: Ray, plane: Array, valid: Array, world: World) -> Real:
-    """Distance along a ray to a plane that it is known to meet."""
+    """Distance along a ray to a plane that it is known to meet; finite if rounding denies that."""
     point, normal = _pick_vector(world.points, plane), _pick_vector(world.normals, plane)
-    cosine = jnp.where(valid, ray.direction.dot(normal), 1.0)
+    cosine = ray.direction.dot(normal)
+    cosine = jnp.where(valid & (cosine != 0), cosine, 1.0)
     return (point - ray.origin).dot(normal) * inverse(cosine)
 
 
