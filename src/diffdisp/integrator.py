@@ -33,7 +33,7 @@ from diffdisp.geometry import (
 )
 from diffdisp.material import Dielectric, Emitter, Lambertian, Material, Metal
 from diffdisp.planning import Plan
-from diffdisp.sampling import Numbers, footprints, uniform_direction
+from diffdisp.sampling import Numbers, sharing, uniform_direction
 from diffdisp.scene import Object, Scene, is_glass, texture_of
 from diffdisp.texture import Checker, Solid, covered, filtered_square_wave, filtered_tiles
 from diffdisp.vector import (
@@ -2277,7 +2277,7 @@ def _to_the_end(
         ended = loop(every_path(False), every_path(True), flat, plan)
     if plan.filtered:
         lanes_of = np.arange(waves * samples * pixels, dtype=np.int32)
-        together = samples // footprints(samples)
+        together = sharing(samples)
 
         def shown(lane: Array, path: Path, start: Path) -> Path:
             number = look_up(lanes.sample, lane // pixels % samples) % together
@@ -2297,7 +2297,7 @@ def _first_choices(lanes: Lanes, plan: Plan) -> Choices:
     """Of paths (S, P): numbers that are even over the samples of each part of a pixel."""
     numbers = Numbers(plan.numbers_per_bounce, lanes.seed, plan.dtype)
     starts = numbers.start(lanes.pixel)
-    together = lanes.sample.shape[0] // footprints(lanes.sample.shape[0])
+    together = sharing(lanes.sample.shape[0])
     part, within = lanes.sample // together, lanes.sample % together
     by_pixel = jax.vmap(numbers.of_film, (0, None, None))
     shift = jax.vmap(by_pixel, (None, 0, None))(starts, part, 2)
@@ -2320,7 +2320,7 @@ def _lit_alike(radiance: Array, lit: Lit, choices: Choices) -> Array:
         choices: of the paths, (J, S, P).
     """
     waves, samples, pixels, channels = radiance.shape
-    together = samples // footprints(samples)
+    together = sharing(samples)
 
     def parts(values: Array) -> Array:
         return values.reshape(waves, -1, together, pixels)

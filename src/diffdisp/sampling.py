@@ -33,6 +33,11 @@ def footprints(samples: int) -> int:
     return count if 4 * count >= min(most, samples) else samples
 
 
+def sharing(samples: int) -> int:
+    """How many of a pixel's samples share each of its `footprints`."""
+    return samples // footprints(samples)
+
+
 def mixed(word: Array) -> Array:
     """A 32-bit word with its bits thoroughly mixed.
 
