@@ -14,16 +14,23 @@ from diffdisp.dispersion import Sellmeier, domain_error
 from diffdisp.film import Film, band_middles
 from diffdisp.fitting import (
     COLOR_WAVELENGTHS,
+    CUTOFF,
     PROFILE,
     Coefficients,
     FitResult,
+    Point,
     StopFit,
     Unknowns,
     _counted,
     _covariance,
     _in_order,
+    _level,
+    _linearise,
     _mean_place,
+    _more_samples,
+    _outlined,
     _probabilities,
+    _problem,
     expected_uncertainty,
     fit,
 )
@@ -691,6 +698,42 @@ def test_place_and_size_from_a_picture_that_does_not_say_how_it_was_drawn():
     # Of z and the radius too. The fit's errors are from one residual: 9 % measured, 2 % elsewhere.
     np.testing.assert_allclose(*zip(*both, strict=True), rtol=0.15)
     assert "too small" not in expected.summary
+
+
+def test_outlines_are_where_a_ball_ends():
+    seen = _outlined(bench(BK7), VISIBLE)
+    # A ball on the axis ends at a circle about the middle of the picture.
+    half = SIZE / 2
+    view = camera()
+    distance = float(np.linalg.norm(view.look_from))
+    edge = np.tan(np.radians(float(view.vertical_fov) / 2)) / half
+    circle = np.tan(np.arcsin(1.0 / distance)) / edge
+    first = np.abs(np.arange(SIZE) - half + 0.5) - 0.5  # of a pixel, from the middle
+    nearest, farthest = np.hypot(first, first[:, None]), np.hypot(first + 1, first[:, None] + 1)
+    np.testing.assert_array_equal(seen, (nearest < circle) & (circle < farthest))
+    assert np.sum(seen) > 4 * circle
+
+
+def test_a_fit_draws_every_pixel_as_well_as_the_noise_asks():
+    blank = Picture(np.zeros((SIZE, SIZE, 8)), VISIBLE.wavelengths)
+    used, free = np.ones((SIZE, SIZE), bool), ("ball.center", "ball.radius")
+    truth = np.asarray(render(displaced(BK7), VISIBLE, samples=4096, dtype="float64"))
+    with jax.enable_x64(True):
+        fixed = used, free, "none", "squares", lambda *_: None
+        problem = _problem(displaced(BK7), 0, blank, *fixed)
+        at = Point(problem.unknowns.coefficients.start(), np.zeros(4))
+        few = _linearise(problem, _level(problem, "", 1, 4, DEPTH, 0), at, CUTOFF)
+        level = _level(problem, "", 1, 4, DEPTH, 0, 2)
+        some = _linearise(problem, level, at, CUTOFF)
+        level, _ = _more_samples(problem, level, few, some, at, DEPTH, NOISE)
+        drawn = _linearise(problem, level, at, CUTOFF, some.columns, of_index=True).picture
+    off = (drawn.reshape(truth.shape) - truth) / NOISE
+    weights = level.weights.reshape(SIZE, SIZE, 1)
+    # What 4096 samples leave open on an outline, here and in the truth: 0.04 each.
+    assert np.max(np.sqrt(weights) * np.abs(off)) < 0.5
+    # Of 3872 values: far below what noise makes of them by chance, which is 90.
+    assert np.sum(weights * off**2) < 10
+    assert np.min(weights) > 0.9
 
 
 @pytest.mark.parametrize("middle", [0.0, 0.4, -1.1])

@@ -20,6 +20,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Float
 
+from diffdisp.camera import camera_ray, project
 from diffdisp.chunks import (
     COLOR_RANGE,
     Pixels,
@@ -45,7 +46,15 @@ from diffdisp.film import Film
 from diffdisp.glass_database import by_C, real_glasses
 from diffdisp.glasses import glass_table
 from diffdisp.image import Picture
-from diffdisp.integrator import Lanes, followed_radiance, lane_radiance
+from diffdisp.integrator import (
+    Lanes,
+    all_spheres,
+    followed_radiance,
+    lane_radiance,
+    nearest,
+    no_surface,
+    world_tables,
+)
 from diffdisp.linearised import Columns, Eliminated, Linearised, linearise
 from diffdisp.misfit import Clipped, Robust
 from diffdisp.parameters import Parameter, Place, named_parameters, value_at, with_coordinates
@@ -66,27 +75,32 @@ COARSE_PIXELS = 32
 FEW_SAMPLES = 4
 """Film samples per pixel on the way to the last level."""
 
-SPLITS = (2, 4, 8, 16, 32)
-"""Into how many parts each way the last level splits a pixel, where the target does not say its own
-samples: most pixels, those that more samples change most, and where numbers of the scene are free,
-those of them that change most with each of the next. With `FEW_SAMPLES` in each part that is 16
-samples a pixel to 4096, by one program."""
+SPLITS: tuple[int, ...] = (2, 4, 8, 16, 32)
+"""Into how many parts each way the last level splits a pixel where numbers of the scene are free
+and the target does not say its own samples: most that show nothing of what is free, all others,
+and of those as many as `REFINED` says with each of the next; those on outlines with all of them.
+With `FEW_SAMPLES` in each part that is 16 samples a pixel to 4096, by one program."""
 
-OF_GLASS_ALONE = (2, 8)
+REFINED: tuple[float, ...] = (1.0, 0.6, 0.2, 0.07)
+"""Parts of the pixels that show something that get each of the next, at most, beside outlines."""
+
+OF_GLASS_ALONE, REFINED_OF_GLASS = (2, 8), (0.5,)
 """The same where no number of the scene is free: 16 and 256 samples. With 64, n of the bench in
 48² pixels and 8 bands is off by half of what a noise of 1 % makes uncertain, with 256 by a
 twentieth."""
 
 FOR_SLOPES = 8
-"""The last of these for slopes alone, which need to be known to a part of themselves."""
+"""The last of these for slopes alone, which need to be known to a part of themselves: with 4 to 32
+the errors of the bench's n_d and places are the same to 2 %."""
 
-REFINED = (0.5, 0.35, 0.2, 0.07)
-"""Parts of the pixels that show the ball that get each of the next, at most."""
+CELLS = 8
+"""Points along each edge of a pixel at which outlines are looked for: what passes between two of
+them cuts off a ten-thousandth of a pixel of a ball that is 27 pixels wide."""
 
 TOLERATED = 0.1
 """Part that an error of a pixel may be of the noise of its channels' mean, since such errors are
-alike in all channels, without still more samples. At 64 samples those next to the rim of the
-bench's ball are as far off as a noise of 1 %; at 1024 a tenth of that."""
+alike in all channels, without still more samples. At 256 samples those on the outline of the
+bench's ball are as far off as a noise of 1 % of that mean; at 4096 an eighth of that."""
 
 HELD = 1e3
 """Weight against which directions that are held move, where the residual's norm is 1."""
@@ -1433,24 +1447,30 @@ def _more_samples(
     Source:
         Richardson, Phil. Trans. A 210 (1911) 307, extrapolation to a step of zero.
     """
-    of_scene, sigma = bool(problem.free.parameters), max(noise, CLEAN * problem.free.brightest)
-    change, seen = np.abs(some.picture - few.picture), int(np.sum(some.weight.any(axis=1)))
-    told, changed = np.max(change * some.weight, axis=1), np.max(change, axis=1)
+    of_scene, sigma = len(problem.free.parameters), max(noise, CLEAN * problem.free.brightest)
+    change, shows = np.abs(some.picture - few.picture), some.weight.any(axis=1)
+    changed, outlined = np.max(change, axis=1), np.zeros(len(change), bool)
     if of_scene:
-        # Of these an outline tells most, where the index may show hardly at all.
-        told = changed = _around(problem, level.blocks, changed)
+        shows |= np.any(some.columns.values[:, :, :of_scene], axis=(0, 2))
+        beside = _near(problem, level.blocks, shows.astype(float)) > 0
+        scene = _with_others(problem, at.others)
+        outlined = beside & _outlined(scene, problem.film).ravel()[level.blocks]
+        told = np.where(shows, changed, -1.0)
+        splits, most = SPLITS, REFINED
+    else:
+        told = np.max(change * some.weight, axis=1)
+        splits, most = OF_GLASS_ALONE, REFINED_OF_GLASS
     # What a quarter of the samples changes tells the error of these, and that of more.
     error, picture = changed / 3, some.picture.copy()
     tolerated = TOLERATED * sigma / np.sqrt(problem.film.channels)
     gains, black = problem.free.exposure(at.others)
-    splits = SPLITS if of_scene else OF_GLASS_ALONE
     rows, pairs = np.arange(len(change)), []
     for step, (fewer, more) in enumerate(itertools.pairwise(splits)):
-        chosen = np.argsort(-told)[: int(seen * REFINED[step])]
-        if step:
-            chosen = chosen[error[rows[chosen]] > tolerated]
-        further = np.zeros(len(rows), bool)
+        chosen = np.argsort(-told)[: int(np.sum(shows) * most[step])]
+        further = outlined[rows]
         further[chosen] = True
+        if step:
+            further &= error[rows] > tolerated
         pairs.append((rows[~further], splits[: step + 1]))
         rows, told = rows[further], told[further]
         error[rows] *= (fewer / more) ** 2
@@ -1458,9 +1478,10 @@ def _more_samples(
             part = _part(problem, 1, FEW_SAMPLES, depth, level.blocks[rows], rows, more)
             traced = _trace(problem, part, at, level.seed, CUTOFF, False, False)
             finer = traced[:, 0] * gains + black
-            changed = np.max(np.abs(finer - picture[rows]), axis=1)
-            picture[rows], error[rows] = finer, changed / 3
-            told = _around(problem, level.blocks[rows], changed)
+            told = np.max(np.abs(finer - picture[rows]), axis=1)
+            picture[rows], error[rows] = finer, told / 3
+            along = rows[outlined[rows]]
+            error[along] = _near(problem, level.blocks[along], error[along])
     pairs.append((rows, splits))
     weighed = level._replace(weights=1 / (1 + (error[:, None] / sigma) ** 2))
 
@@ -1478,19 +1499,50 @@ def _more_samples(
     return drawn(splits[-1]), drawn(FOR_SLOPES)
 
 
-def _around(problem: Problem, blocks: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """The largest value of each pixel (blocks,) and its neighbours.
+def _outlined(scene: Scene, film: Film) -> np.ndarray:
+    """Pixels (height, width) in which the camera sees more than one surface.
 
-    An outline may pass between the few samples of one pixel and meet those of the next.
+    An outline passes between samples, or cuts off less of a pixel than one of them stands for: what
+    a few samples show does not tell how wrong they are.
     """
-    width, height = problem.film.width, problem.film.height
-    whole = np.zeros(width * height)
-    whole[blocks] = values
-    wide = np.pad(whole.reshape(height, width), 1)
-    moves = itertools.product(range(3), repeat=2)
-    near = [wide[down : down + height, right : right + width] for down, right in moves]
-    largest: np.ndarray = np.max(near, axis=0).ravel()[blocks]
-    return largest
+    plan = make_plan(scene, film, 1, 1, "float64")
+    down, right = (np.arange(count * CELLS + 1) / CELLS for count in (film.height, film.width))
+    seen = np.asarray(_surfaces_seen(plan, without_names(scene), film_size(film), right, down))
+    height, width = film.height * CELLS, film.width * CELLS
+    mixed = np.zeros((film.height, film.width), bool)
+    for y, x in itertools.product(range(CELLS + 1), repeat=2):
+        mixed |= (
+            seen[y : y + height : CELLS, x : x + width : CELLS] != seen[:height:CELLS, :width:CELLS]
+        )
+    return mixed
+
+
+@partial(jax.jit, static_argnums=0)
+def _surfaces_seen(
+    plan: Plan, scene: Scene, size: tuple[Real, Real], right: Array, down: Array
+) -> jax.Array:
+    """Numbers (down, right) of the surfaces that the camera sees at points of the film, pixels."""
+    world, projection = world_tables(scene), project(scene.camera, *size)
+    spheres = all_spheres(world, plan, None)
+
+    def at(x: Real, y: Real) -> Array:
+        return nearest(camera_ray(projection, x, y), world, plan, no_surface(x), spheres)
+
+    return jax.lax.map(lambda y: jax.vmap(at, (0, None))(right, y), down)
+
+
+def _near(problem: Problem, blocks: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Root mean square of the values (blocks,) of those of some pixels that are near each."""
+    film, reach = problem.film, 2
+    there = np.zeros((2, film.height * film.width))
+    there[:, blocks] = values**2, np.ones_like(values)
+    wide = np.pad(
+        there.reshape(2, film.height, film.width), ((0, 0), (reach, reach), (reach, reach))
+    )
+    windows = np.lib.stride_tricks.sliding_window_view(wide, (2 * reach + 1,) * 2, axis=(1, 2))
+    squares, counts = np.sum(windows, axis=(3, 4)).reshape(2, -1)[:, blocks]
+    mean: np.ndarray = np.sqrt(squares / counts)
+    return mean
 
 
 def _starts(problem: Problem, level: Level, most: int) -> list[Point]:
