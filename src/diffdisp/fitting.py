@@ -1432,6 +1432,10 @@ def _more_samples(
     the area of a footprint, the render of fewer samples, weighed against that of more, cancels
     most of it.
 
+    What a change tells of one pixel is no more than a chance where an outline crosses it and a
+    number of the scene moves that: a sample that jumps over the outline is a step in the sum of
+    squares. Such pixels go on as long as those along the outline together still change.
+
     Args:
         problem: what stays the same.
         level: the whole picture with as many samples as most pixels get.
