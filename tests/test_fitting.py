@@ -23,12 +23,13 @@ from diffdisp.fitting import (
     Unknowns,
     _counted,
     _covariance,
+    _crossed,
     _in_order,
+    _in_pixels,
     _level,
     _linearise,
     _mean_place,
     _more_samples,
-    _outlined,
     _probabilities,
     _problem,
     expected_uncertainty,
@@ -701,7 +702,7 @@ def test_place_and_size_from_a_picture_that_does_not_say_how_it_was_drawn():
 
 
 def test_outlines_are_where_a_ball_ends():
-    seen = _outlined(bench(BK7), VISIBLE)
+    seen = _in_pixels(_crossed(bench(BK7), VISIBLE)).any(axis=(1, 2)).reshape(SIZE, SIZE)
     # A ball on the axis ends at a circle about the middle of the picture.
     half = SIZE / 2
     view = camera()
