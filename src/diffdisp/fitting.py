@@ -77,9 +77,9 @@ FEW_SAMPLES = 4
 
 SPLITS: tuple[int, ...] = (2, 4, 8, 16, 32)
 """Into how many parts each way the last level splits a pixel where numbers of the scene are free
-and the target does not say its own samples: most that show nothing of what is free, all others,
-and of those as many as `REFINED` says with each of the next; those on outlines with all of them.
-With `FEW_SAMPLES` in each part that is 16 samples a pixel to 4096, by one program."""
+and the target does not say its own samples: those that show nothing of what is free, all others,
+and of those as many as `REFINED` says with each of the next; on outlines see `CELLS`. With
+`FEW_SAMPLES` in each part that is 16 samples a pixel to 4096, by one program."""
 
 REFINED: tuple[float, ...] = (1.0, 0.6, 0.2, 0.07)
 """Parts of the pixels that show something that get each of the next, at most, beside outlines."""
