@@ -1490,7 +1490,8 @@ def _more_samples(
         if step:
             further &= error[rows] > tolerated
         pairs.append((rows[~further], splits[: step + 1]))
-        if of_scene and fewer == CELLS:
+        # Light that scatters by chance is as noisy in the rest of a pixel as along an outline.
+        if fewer == CELLS and not level.parts[0].plan.scattering:
             cut = rows[further & outlined[rows]]
             further &= ~outlined[rows]
         rows, told = rows[further], told[further]
@@ -1558,9 +1559,7 @@ def _crossed(scene: Scene, film: Film) -> np.ndarray:
     down, right = (np.arange(count * CELLS + 1) / CELLS for count in (film.height, film.width))
     seen = np.asarray(_surfaces_seen(plan, without_names(scene), film_size(film), right, down))
     corner = seen[:-1, :-1]
-    others = seen[:-1, 1:], seen[1:, :-1], seen[1:, 1:]
-    crossed: np.ndarray = np.any([corner != other for other in others], axis=0)
-    return crossed
+    return (corner != seen[:-1, 1:]) | (corner != seen[1:, :-1]) | (corner != seen[1:, 1:])
 
 
 @partial(jax.jit, static_argnums=0)
@@ -1580,9 +1579,7 @@ def _surfaces_seen(
 def _with_neighbours(cells: np.ndarray) -> np.ndarray:
     """The cells (height, width), and those that share an edge with one of them."""
     wide = np.pad(cells, 1)
-    sides = wide[:-2, 1:-1], wide[2:, 1:-1], wide[1:-1, :-2], wide[1:-1, 2:]
-    near: np.ndarray = np.any([cells, *sides], axis=0)
-    return near
+    return cells | wide[:-2, 1:-1] | wide[2:, 1:-1] | wide[1:-1, :-2] | wide[1:-1, 2:]
 
 
 def _in_pixels(cells: np.ndarray) -> np.ndarray:
