@@ -39,10 +39,11 @@ from diffdisp.glasses import glass_table, named_glass
 from diffdisp.image import Picture, read_picture, write_picture
 from diffdisp.linearised import Columns, linearise
 from diffdisp.rendering import render
-from diffdisp.scene import Scene
+from diffdisp.scene import Scene, with_glass
 from diffdisp.scene_file import load_scene
 
-TARGETS = Path(__file__).parents[1] / "fixtures" / "targets"
+FIXTURES = Path(__file__).parents[1] / "fixtures"
+TARGETS = FIXTURES / "targets"
 SILICA = named_glass("fused silica")
 
 # One size, one number of bands, of samples and of segments: one compiled program for most tests.
@@ -699,6 +700,47 @@ def test_place_and_size_from_a_picture_that_does_not_say_how_it_was_drawn():
     # Of z and the radius too. The fit's errors are from one residual: 9 % measured, 2 % elsewhere.
     np.testing.assert_allclose(*zip(*both, strict=True), rtol=0.15)
     assert "too small" not in expected.summary
+
+
+def on_matte_ground(glass: Sellmeier) -> Scene:
+    return with_glass(load_scene(str(FIXTURES / "scenes/matte_ground.toml")), 0, glass)
+
+
+FEW_BANDS = Film(24, 24, band_middles(450.0, 650.0, 3))
+
+
+@pytest.fixture(scope="module")
+def matte_ground() -> np.ndarray:
+    return np.asarray(render(on_matte_ground(BK7), FEW_BANDS, samples=8192, dtype="float64"))
+
+
+def test_a_glass_over_a_matte_ground(matte_ground):
+    noisy = with_noise(Picture(matte_ground, FEW_BANDS.wavelengths), 4)
+    used = np.ones(noisy.radiance.shape[:2], bool)
+    used[3:6, 10:14] = False  # within the ball
+    noisy.radiance[~used] = 9.0
+    result = fit(on_matte_ground(SILICA), noisy, noise=NOISE, mask=used)
+    assert result.converged, result.message
+    # Where edges had no slopes this was 12 errors off, and those 40 times as large.
+    assert abs(result.n_d - float(BK7.n_d)) < 4 * result.n_d_std < 8e-4
+    assert np.all(abs(result.n - np.asarray(BK7.indices(result.wavelengths))) < 4 * result.n_std)
+    expected = expected_uncertainty(on_matte_ground(BK7), FEW_BANDS, noise=NOISE)
+    # Without the masked pixels, a fifth of what the ball shows best, errors are larger.
+    np.testing.assert_allclose(result.n_d_std, expected.n_d_std, rtol=0.25)
+    assert result.samples == expected.samples
+    # The picture is drawn there too, its own noise a third of the target's.
+    assert np.abs(result.picture - matte_ground)[~used].max() < 2 * NOISE
+
+
+def test_a_glass_over_a_matte_ground_in_a_picture_of_our_own():
+    film, knobs = Film(16, 16, FEW_BANDS.wavelengths), {"samples": 64, "depth": DEPTH, "seed": 3}
+    shown = np.asarray(render(on_matte_ground(BK7), film, dtype="float64", **knobs))
+    target = Picture(shown, film.wavelengths, **knobs)
+    result = fit(on_matte_ground(SILICA), target)
+    assert result.converged, result.message
+    # The same paths, but for those that a border of tiles still lies between: 0.02 with others.
+    assert result.rms_residual < 3e-3
+    assert abs(result.n_d - float(BK7.n_d)) < 4 * result.n_d_std < 3e-4
 
 
 def test_outlines_are_where_a_ball_ends():

@@ -127,3 +127,17 @@ def test_cubes_near_a_horizon_seen_through_a_ball():
     odd = 0.5 * (off - off[::-1])
     print(f"{np.sqrt(np.mean(odd**2)):.4f}")
     assert np.sqrt(np.mean(odd**2)) < 0.003
+
+
+def test_bands_whose_paths_fill_no_block():
+    # What is followed together is filled up with copies; they are none of the picture's paths.
+    def slopes(bands):
+        def seen(n):
+            return render(with_glass(FROM_ABOVE, 0, glass(n)), Film(24, 24, bands), samples=4)
+
+        return jax.jit(lambda n: jax.jvp(seen, (n,), (1.0,)))(jnp.asarray(N))
+
+    together, alone = slopes(np.array([0.45, 0.55, 0.65])), slopes(np.array([0.55]))
+    # A glass of one index: all bands are the same picture, drawn by the same numbers.
+    for found, expected in zip(together, alone, strict=True):
+        np.testing.assert_allclose(found, expected.repeat(3, axis=-1), rtol=1e-9, atol=1e-9)

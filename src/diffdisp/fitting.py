@@ -60,6 +60,7 @@ from diffdisp.misfit import Clipped, Robust
 from diffdisp.parameters import Parameter, Place, named_parameters, value_at, with_coordinates
 from diffdisp.planning import Plan, make_plan
 from diffdisp.programs import COMPILER_OPTIONS
+from diffdisp.rendering import passes
 from diffdisp.scene import Scene, is_glass, object_glass, with_glass, without_names
 from diffdisp.vector import Array, Real
 
@@ -96,6 +97,19 @@ the errors of the bench's n_d and places are the same to 2 %."""
 CELLS = 8
 """Cells along each edge of a pixel that an outline crosses, one of `SPLITS`: those that it crosses,
 and those beside them, get the samples of the last one, the others those of this."""
+
+SLOPES_BY_CHANCE = 64
+"""Samples of each pixel for slopes where light scatters by chance; steps need no better ones.
+Measured on a ball over a matte ground, against 256: 9 % off, in a third of the time."""
+
+FIRST_DRAWN, MOST_DRAWN = 256, 1 << 27
+"""Where light scatters by chance the picture is one of `render`: samples of each pixel on the way,
+and the most paths of a picture, some 20 seconds of two cores. It is far less noisy for its time
+than the one that comes with slopes: 0.0018 in 5 s where that has 0.007 in 19 s."""
+
+QUIET = 0.3
+"""Part of the target's noise that such a picture may have, within `MOST_DRAWN`: that makes errors
+larger by 4 %."""
 
 TOLERATED = 0.1
 """Part that an error of a pixel may be of the noise of its channels' mean, since such errors are
@@ -153,6 +167,10 @@ NEAR_STEP, ROUGH = 30.0, 1.1
 """A step that changes the picture by less than this many times its noise is taken though the sum
 of squares rises a little: some samples jump where a silhouette crosses them, by more than what is
 left to gain, but hardly move the point at which the slopes and the residual are at right angles."""
+
+FRUITLESS = 10.0
+"""Damping of the third step on a drawn picture that lowers nothing, after a whole one and half of
+it: paths that jump over borders then change it more than what is left to gain."""
 
 LEAST_CHANGE = (1e-13, 1e-9)
 """Changes of n below this are rounding; and for colour, whose slopes are along six polynomials and
@@ -580,6 +598,8 @@ class Level(NamedTuple):
         seed: of the render.
         clipped: values of the target that were cut off; None where there are none.
         robust: the loss; None for squares.
+        drawing: the render that the picture is, where light scatters by chance; the parts are then
+            for slopes alone. None where the parts are the picture.
     """
 
     name: str
@@ -591,6 +611,24 @@ class Level(NamedTuple):
     seed: int
     clipped: Clipped | None
     robust: Robust | None
+    drawing: "Drawing | None" = None
+
+
+class Drawing(NamedTuple):
+    """A picture of `render`.
+
+    Args:
+        samples: of each pixel.
+        depth: segments of a path.
+        seed: of the numbers that paths draw.
+        apart: whether each band draws numbers of its own, so that bands err independently, as
+            their noise does; else it is the picture that `render` makes of all of them.
+    """
+
+    samples: int
+    depth: int
+    seed: int
+    apart: bool
 
 
 def fit(
@@ -729,18 +767,26 @@ def expected_uncertainty(
 def _expected(problem: Problem, prior: str, noise: float) -> Uncertainty:
     """The last level of a fit to the picture that the scene itself makes."""
     at = Point(problem.unknowns.coefficients.start(), np.zeros(problem.free.total))
-    few = _linearise(problem, _level(problem, FEW, 1, FEW_SAMPLES, 50, 0), at, CUTOFF)
+    few_level = _level(problem, FEW, 1, FEW_SAMPLES, 50, 0)
+    few = _linearise(problem, few_level, at, CUTOFF)
     if few.seen == 0:
         raise ValueError("no pixel of such a picture depends on this glass")
     brightest = float(np.max(np.abs(few.picture))) or 1.0
     problem = problem._replace(free=problem.free._replace(brightest=brightest))
-    many = _level(problem, LAST, 1, FEW_SAMPLES, 50, 0, SPLITS[0])
-    some = _linearise(problem, many, at, CUTOFF)
-    level, slopes = _more_samples(problem, many, few, some, at, 50, noise)
-    known = some.columns
-    if problem.free.parameters:
-        known = _linearise(problem, slopes, at, CUTOFF).columns
-    seen = _linearise(problem, level, at, CUTOFF, known, of_index=True)
+    if few_level.parts[0].plan.scattering:
+        drawing = Drawing(FIRST_DRAWN, 50, 0, apart=True)
+        level = _level(problem, LAST, 1, SLOPES_BY_CHANCE, 50, 0)._replace(drawing=drawing)
+        seen = _linearise(problem, level, at, CUTOFF)
+        level, left = _drawn_enough(problem, level, _own_noise(problem, level, seen, at), noise)
+        level = level._replace(weights=level.weights / (1 + (left / noise) ** 2))
+    else:
+        many = _level(problem, LAST, 1, FEW_SAMPLES, 50, 0, SPLITS[0])
+        some = _linearise(problem, many, at, CUTOFF)
+        level, slopes = _more_samples(problem, many, few, some, at, 50, noise)
+        known = some.columns
+        if problem.free.parameters:
+            known = _linearise(problem, slopes, at, CUTOFF).columns
+        seen = _linearise(problem, level, at, CUTOFF, known, of_index=True)
     # A pixel's weight says how much of its residual is what samples leave open, beside the noise:
     # all residuals, weighed, are to be as large as the noise.
     residual = noise / np.sqrt(np.where(level.weights > 0, level.weights, 1.0))
@@ -949,6 +995,7 @@ def _part(
     """
     film = problem.film
     plan = replace(make_plan(problem.scene, film, samples, depth, "float64"), dispersive=True)
+    plan = replace(plan, filtered=plan.scattering)
     spectrum = film_spectrum(film, plan, seed=0)
     width = film.width // size
     if cells is None:
@@ -1053,7 +1100,7 @@ def _trace(
 
     # A ball's outline moves with it; slopes of points of it are far from a pixel's. Of a picture
     # that is drawn as the target was they are the true ones all the same.
-    soft = part.split > 1 and not (part.plan.nested or part.plan.scattering)
+    soft = part.split > 1 and not part.plan.nested
     plan = replace(part.plan, soft=soft and bool(places))
 
     def trace(chunks: Pixels) -> np.ndarray:
@@ -1090,9 +1137,12 @@ def _linearise(
     tangents, along = len(level.parts[0].tangents), count if known is None else 0
     traced_tangents = 0 if of_index else tangents
     joined = np.zeros((len(level.target), 1 + along + traced_tangents, channels))
-    for part in level.parts:
+    for part in () if level.drawing and known is not None and of_index else level.parts:
         traced = _trace(problem, part, at, level.seed, cutoff, known is None, not of_index)
         joined[part.rows] += part.share * traced
+    if level.drawing:
+        drawn = _drawn(problem, level.drawing, at)
+        joined[:, 0] = drawn.reshape(-1, channels)[level.blocks]
     gains, black = free.exposure(at.others)
     joined *= gains
     radiance, slopes = joined[:, :1], joined[:, 1:]
@@ -1117,6 +1167,24 @@ def _linearise(
         free.total + len(problem.unknowns.project),
     )
     return _reduced(level, radiance[:, 0] + black, columns)
+
+
+def _drawn(
+    problem: Problem, drawing: Drawing, at: Point
+) -> Float[np.ndarray, "height width channels"]:
+    """The radiance of a render at a point."""
+    film, glass = problem.film, Sellmeier(*problem.unknowns.coefficients.values(at.z))
+    scene = with_glass(_with_others(problem, at.others), problem.number, glass)
+    films = [film]
+    if drawing.apart and film.wavelengths is not None:
+        waves = np.asarray(film.wavelengths)
+        films = [replace(film, wavelengths=wave[None]) for wave in waves]
+    pictures = []
+    for number, some in enumerate(films):
+        settings = drawing.samples, drawing.depth, drawing.seed + number, "float64"
+        *_, last = passes(scene, some, *settings)
+        pictures.append(last.radiance)
+    return np.concatenate(pictures, axis=-1)
 
 
 def _reduced(level: Level, picture: np.ndarray, columns: Columns) -> Linearised:
@@ -1385,9 +1453,11 @@ def _descend(
             _objective(unknowns, picture, point, anchor, lin.noise)
             for picture, point in ((lin, at), (tried, new))
         )
-        rough = near and has < ROUGH * had
+        rough = near and has < ROUGH * had and not level.drawing
         if has > had and largest < 100 * least:
             converged = True  # what is left of the residual is rounding
+        elif has > had and level.drawing and damping >= FRUITLESS:
+            converged = True  # or paths that jump over borders
         elif has <= had or rough:
             before = 0.0 if damping else largest
             at, damping = new, damping / 10 if damping > 1e-2 else 0.0
@@ -1426,6 +1496,48 @@ def _refined(
     residual = np.abs(some.score)[some.weight > 0]
     shown = _deviation(residual, np.ones_like(residual))
     return _more_samples(problem, level, few.lin, some, few.at, depth, shown), at
+
+
+def _own_noise(problem: Problem, level: Level, lin: Linearised, at: Point) -> float:
+    """Noise of a drawn level's own, in pixels that show something of the glass.
+
+    Args:
+        problem: what stays the same.
+        level: the whole picture.
+        lin: the picture and its slopes.
+        at: where they are.
+    """
+    assert level.drawing is not None
+    first, second = (
+        _drawn(problem, level.drawing._replace(seed=seed, apart=True), at)
+        for seed in (level.seed, ~level.seed)
+    )
+    gains, _ = problem.free.exposure(at.others)
+    change = ((first - second) * gains).reshape(-1, problem.film.channels)[level.blocks]
+    return float(np.sqrt(np.mean(change[lin.weight.any(axis=1)] ** 2) / 2))
+
+
+def _drawn_enough(problem: Problem, level: Level, own: float, noise: float) -> tuple[Level, float]:
+    """A level drawn with as many samples as the target's noise asks for; its own noise then.
+
+    Args:
+        problem: what stays the same.
+        level: the whole picture, drawn with few.
+        own: its own noise.
+        noise: of the target's values.
+    """
+    film, drawing = problem.film, level.drawing
+    assert drawing is not None
+    # The channels of a colour picture are drawn by the same paths, and err alike.
+    alike = 1 if film.wavelengths is not None else film.channels
+    least = CLEAN * problem.free.brightest
+    wanted = drawing.samples * alike * (own / (QUIET * max(noise, least))) ** 2
+    most = max(MOST_DRAWN // (film.width * film.height * film.channels), 1)
+    # Powers of two have divisors to go through them by.
+    enough = min(np.ceil(np.log2(max(wanted, 1.0))), np.floor(np.log2(most)))
+    samples = max(2 ** int(enough), drawing.samples)
+    left = own * np.sqrt(drawing.samples / samples)
+    return level._replace(drawing=drawing._replace(samples=samples)), float(left)
 
 
 def _more_samples(
@@ -1490,8 +1602,7 @@ def _more_samples(
         if step:
             further &= error[rows] > tolerated
         pairs.append((rows[~further], splits[: step + 1]))
-        # Light that scatters by chance is as noisy in the rest of a pixel as along an outline.
-        if fewer == CELLS and not level.parts[0].plan.scattering:
+        if fewer == CELLS:
             cut = rows[further & outlined[rows]]
             further &= ~outlined[rows]
         rows, told = rows[further], told[further]
@@ -1841,32 +1952,62 @@ def _search(problem: Problem, target: Picture) -> "tuple[Level, Descent]":
     ]
     best = min(ends, key=lambda end: end.lin.cost)
     best = _descend(problem, level, best.at, CUTOFF, 8, 1.0)
-    along = None
-    if target.samples is None:
+    along, small = None, LINEAR_STEP
+    if level.parts[0].plan.scattering:
+        level, along, best = _drawn_level(problem, target, best, depth, seed)
+        finest, at, small = level, best.at, SMALL_STEP
+    elif target.samples is None:
         level = _level(problem, FEW, 1, FEW_SAMPLES, depth, seed)
         along = _level(problem, LAST, 1, FEW_SAMPLES, depth, seed, SPLITS[0])
-        small = FEW_STEP if problem.free.parameters else 1.0
-        best = _descend(problem, level, best.at, CUTOFF, 20, small)
+        few_step = FEW_STEP if problem.free.parameters else 1.0
+        best = _descend(problem, level, best.at, CUTOFF, 20, few_step)
         (finest, level), at = _refined(problem, best, along, depth)
     else:
         level, at = _level(problem, LAST, 1, target.samples, depth, seed), best.at
         finest = level
-    best = _descend(problem, level, at, CUTOFF, 30, LINEAR_STEP, along)
+    best = _descend(problem, level, at, CUTOFF, 30, small, along)
     if level.robust is not None:
         tukey = Robust("tukey", best.spread)
         level, finest = (each._replace(robust=tukey) for each in (level, finest))
-        cut = _descend(problem, level, best.at, CUTOFF, 30, LINEAR_STEP, along)
+        cut = _descend(problem, level, best.at, CUTOFF, 30, small, along)
         best = cut._replace(steps=best.steps + cut.steps)
     error = best.lin.noise / max(float(np.max(np.abs(best.lin.eliminated().r))), 1e-300)
-    if NEGLECTED * CUTOFF > SMALL_STEP * error:
+    if NEGLECTED * CUTOFF > SMALL_STEP * error and level.drawing is None:
         # So clean a picture shows the light of the paths that were ended early.
         if problem.free.parameters and target.samples is None:
             along = level
         exact = _descend(problem, finest, best.at, 0.0, 30, SMALL_STEP, along)
         best = exact._replace(steps=best.steps + exact.steps)
     elif problem.free.parameters and best.converged and best.lin.seen:
-        best = _polished(problem, finest, level, best)
+        best = _polished(problem, finest, along if level.drawing and along else level, best)
     return finest, best
+
+
+def _drawn_level(
+    problem: Problem, target: Picture, coarse: Descent, depth: int, seed: int
+) -> tuple[Level, Level, Descent]:
+    """The last level where light scatters by chance, the level of its slopes, and where to start.
+
+    A picture that says how it was drawn is drawn so; for others steps on few samples come first,
+    that tell how noisy both are.
+
+    Args:
+        problem: what stays the same.
+        target: as it was given.
+        coarse: where the steps on the coarse picture ended.
+        depth: segments of a path.
+        seed: of the numbers that paths draw.
+    """
+    along = _level(problem, LAST, 1, SLOPES_BY_CHANCE, depth, seed)
+    own = target.samples is not None
+    drawing = Drawing(target.samples or FIRST_DRAWN, depth, seed, apart=not own)
+    level = along._replace(drawing=drawing)
+    if own:
+        return level, along, coarse
+    few = _descend(problem, level._replace(name=FEW), coarse.at, CUTOFF, 20, 1.0, along)
+    drawn = _own_noise(problem, level, few.lin, few.at) if few.lin.seen else 0.0
+    rest = np.sqrt(max(few.lin.noise**2 - drawn**2, 0.0))
+    return _drawn_enough(problem, level, drawn, rest)[0], along, few
 
 
 def _polished(problem: Problem, level: Level, slopes: Level, end: Descent) -> Descent:
@@ -2082,9 +2223,16 @@ def _uncertainty(
         + _edges_without(level.parts[0].plan, bool(free.parameters)),
         prior=prior,
         noise=noise.sigma,
-        samples=tuple(sorted({part.plan.samples * part.split**2 for part in level.parts})),
+        samples=_samples(level),
         free=tuple(_free_values(free, scene, at.others, errors)),
     )
+
+
+def _samples(level: Level) -> tuple[int, ...]:
+    """How many samples a level's pixels have."""
+    if level.drawing:
+        return (level.drawing.samples,)
+    return tuple(sorted({part.plan.samples * part.split**2 for part in level.parts}))
 
 
 def _whole_picture(problem: Problem, level: Level, end: Descent, stopped: bool) -> np.ndarray:
@@ -2101,7 +2249,11 @@ def _whole_picture(problem: Problem, level: Level, end: Descent, stopped: bool) 
         beyond = (0, film.height - height * size), (0, film.width - width * size), (0, 0)
         return np.pad(wide, beyond, mode="edge")
     rest = np.flatnonzero(~problem.used)
-    if len(rest) and not stopped:
+    if len(rest) and not stopped and level.drawing:
+        gains, black = problem.free.exposure(end.at.others)
+        whole = _drawn(problem, level.drawing, end.at).reshape(len(blocks), -1)
+        blocks[rest] = whole[rest] * gains + black
+    elif len(rest) and not stopped:
         like, (gains, black) = level.parts[0], problem.free.exposure(end.at.others)
         own = np.arange(len(rest))
         part = _part(problem, 1, like.plan.samples, like.plan.depth, rest, own, like.split)
@@ -2198,7 +2350,7 @@ def _edges_without(plan: Plan, moves: bool) -> str:
         moves: whether numbers of the scene are free.
     """
     if plan.scattering:
-        return UNDERSTATED.format("edges of textures and outlines")
+        return UNDERSTATED.format("shadows, caustics and what is reflected many times")
     return UNDERSTATED.format("outlines of glass balls") if plan.nested and moves else ""
 
 

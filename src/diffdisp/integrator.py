@@ -2415,13 +2415,12 @@ def _until_done(enter: Step | None, advance: Step, paths: Path, plan: Plan) -> P
             path,
         )
 
-    paths = jax.tree.map(padded, paths)
     numbers = jnp.arange(total + spare, dtype=jnp.int32)
     results = jax.tree.map(
         lambda leaf: jnp.zeros(total + 1, leaf.dtype),
         (paths.radiance, paths.lit, paths.choices),
     )
-    state = (numbers, paths), jnp.asarray(total, jnp.int32), results
+    state = (numbers, jax.tree.map(padded, paths)), jnp.asarray(total, jnp.int32), results
     if enter is not None:
         state = sweep(once_in, state)
     state = jax.lax.while_loop(lambda state: state[1] > 0, partial(sweep, thinned), state)

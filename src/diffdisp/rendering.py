@@ -131,15 +131,28 @@ def render_progressively(
     Raises:
         ValueError: as in `render`.
     """
-    dtype = dtype or jnp.result_type(float).name
     check_glasses(scene, *film_range(film))
+    dtype = dtype or jnp.result_type(float).name
+    yield from passes(scene, film, samples, depth, seed, dtype, progress)
+
+
+def passes(
+    scene: Scene,
+    film: Film,
+    samples: int,
+    depth: int,
+    seed: int,
+    dtype: str,
+    progress: Progress | None = None,
+) -> Iterator[Growing]:
+    """`render_progressively` of glasses that have been checked, or have no index somewhere."""
     work = _lay_out(scene, film, samples, depth, dtype, seed)
-    total, passes = np.zeros((), dtype), len(work.cells)
-    for number in range(passes):
+    total, count = np.zeros((), dtype), len(work.cells)
+    for number in range(count):
 
         def tell(done: int, of: int, number: int = number) -> None:
             if progress:
-                progress(number * of + done, passes * of)
+                progress(number * of + done, count * of)
 
         shown = _one_pass(work, film, seed, number, tell)
         total = total + shown if number else shown
