@@ -725,7 +725,7 @@ def test_a_glass_over_a_matte_ground(matte_ground):
     assert abs(result.n_d - float(BK7.n_d)) < 4 * result.n_d_std < 8e-4
     assert np.all(abs(result.n - np.asarray(BK7.indices(result.wavelengths))) < 4 * result.n_std)
     expected = expected_uncertainty(on_matte_ground(BK7), FEW_BANDS, noise=NOISE)
-    # Without the masked pixels, a fifth of what the ball shows best, errors are larger.
+    # Without the masked pixels, a quarter of what the picture tells, errors are a sixth larger.
     np.testing.assert_allclose(result.n_d_std, expected.n_d_std, rtol=0.25)
     assert result.samples == expected.samples
     # The picture is drawn there too, its own noise a third of the target's.

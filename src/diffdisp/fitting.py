@@ -770,16 +770,14 @@ def expected_uncertainty(
 def _expected(problem: Problem, prior: str, noise: float) -> Uncertainty:
     """The last level of a fit to the picture that the scene itself makes."""
     at = Point(problem.unknowns.coefficients.start(), np.zeros(problem.free.total))
-    few_level = _level(problem, FEW, 1, FEW_SAMPLES, 50, 0)
-    few = _linearise(problem, few_level, at, CUTOFF)
+    few = _linearise(problem, _level(problem, FEW, 1, FEW_SAMPLES, 50, 0), at, CUTOFF)
     if few.seen == 0:
         raise ValueError("no pixel of such a picture depends on this glass")
     brightest = float(np.max(np.abs(few.picture))) or 1.0
     problem = problem._replace(free=problem.free._replace(brightest=brightest))
-    if few_level.parts[0].plan.scattering:
+    if _by_chance(problem):
         drawing = Drawing(FIRST_DRAWN, 50, 0, apart=True)
-        samples = SLOPES_BY_CHANCE[bool(problem.free.parameters)]
-        level = _level(problem, LAST, 1, samples, 50, 0)._replace(drawing=drawing)
+        level = _slopes_by_chance(problem, 50, 0)._replace(drawing=drawing)
         seen = _linearise(problem, level, at, CUTOFF)
         level, left = _drawn_enough(problem, level, _own_noise(problem, level, seen, at), noise)
         level = level._replace(weights=level.weights / (1 + (left / noise) ** 2))
@@ -1948,11 +1946,11 @@ def _search(problem: Problem, target: Picture) -> "tuple[Level, Descent]":
     """Coarse to fine: the best of several starts, then the whole picture, then its final form."""
     film, depth, seed = problem.film, target.depth or 50, target.seed or 0
     coarse = max(1, -(-max(film.width, film.height) // COARSE_PIXELS))
-    level = _level(problem, COARSE, coarse, FEW_SAMPLES, depth, seed)
-    chance = level.parts[0].plan.scattering
+    chance = _by_chance(problem)
+    samples = COARSE_BY_CHANCE if chance else FEW_SAMPLES
+    level = _level(problem, COARSE, coarse, samples, depth, seed)
     if chance:
         drawing = Drawing(max(FIRST_DRAWN // coarse**2, 1), depth, seed, apart=True)
-        level = _level(problem, COARSE, coarse, COARSE_BY_CHANCE, depth, seed)
         level = level._replace(drawing=drawing)
     # With all six coordinates a band can stay in a minimum of its own, where n is wrong in that
     # band alone, from a resonance that moves next to it.
@@ -1989,8 +1987,20 @@ def _search(problem: Problem, target: Picture) -> "tuple[Level, Descent]":
         exact = _descend(problem, finest, best.at, 0.0, 30, SMALL_STEP, along)
         best = exact._replace(steps=best.steps + exact.steps)
     elif problem.free.parameters and best.converged and best.lin.seen:
-        best = _polished(problem, finest, along if level.drawing and along else level, best)
+        slopes = level if level.drawing is None else _slopes_by_chance(problem, depth, seed)
+        best = _polished(problem, finest, slopes, best)
     return finest, best
+
+
+def _by_chance(problem: Problem) -> bool:
+    """Whether light scatters, so that pictures are drawn by chance."""
+    return make_plan(problem.scene, problem.film, 1, 1, "float64").scattering
+
+
+def _slopes_by_chance(problem: Problem, depth: int, seed: int) -> Level:
+    """The level of the slopes of such pictures."""
+    samples = SLOPES_BY_CHANCE[bool(problem.free.parameters)]
+    return _level(problem, LAST, 1, samples, depth, seed)
 
 
 def _drawn_level(
@@ -2008,7 +2018,7 @@ def _drawn_level(
         depth: segments of a path.
         seed: of the numbers that paths draw.
     """
-    along = _level(problem, LAST, 1, SLOPES_BY_CHANCE[bool(problem.free.parameters)], depth, seed)
+    along = _slopes_by_chance(problem, depth, seed)
     own = target.samples is not None
     drawing = Drawing(target.samples or FIRST_DRAWN, depth, seed, apart=not own)
     level = along._replace(drawing=drawing)
@@ -2259,16 +2269,15 @@ def _whole_picture(problem: Problem, level: Level, end: Descent, stopped: bool) 
         beyond = (0, film.height - height * size), (0, film.width - width * size), (0, 0)
         return np.pad(wide, beyond, mode="edge")
     rest = np.flatnonzero(~problem.used)
-    if len(rest) and not stopped and level.drawing:
-        gains, black = problem.free.exposure(end.at.others)
-        whole = _drawn(problem, level.drawing, end.at).reshape(len(blocks), -1)
-        blocks[rest] = whole[rest] * gains + black
-    elif len(rest) and not stopped:
+    if len(rest) and not stopped:
         like, (gains, black) = level.parts[0], problem.free.exposure(end.at.others)
-        own = np.arange(len(rest))
-        part = _part(problem, 1, like.plan.samples, like.plan.depth, rest, own, like.split)
-        traced = _trace(problem, part, end.at, level.seed, CUTOFF, False, True)
-        blocks[rest] = traced[:, 0] * gains + black
+        if level.drawing:
+            shown = _block_means(1, _drawn(problem, level.drawing, end.at))[rest]
+        else:
+            own = np.arange(len(rest))
+            part = _part(problem, 1, like.plan.samples, like.plan.depth, rest, own, like.split)
+            shown = _trace(problem, part, end.at, level.seed, CUTOFF, False, True)[:, 0]
+        blocks[rest] = shown * gains + black
     return blocks.reshape(problem.target.shape)
 
 

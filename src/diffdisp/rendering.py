@@ -131,8 +131,8 @@ def render_progressively(
     Raises:
         ValueError: as in `render`.
     """
-    check_glasses(scene, *film_range(film))
     dtype = dtype or jnp.result_type(float).name
+    check_glasses(scene, *film_range(film))
     yield from passes(scene, film, samples, depth, seed, dtype, progress)
 
 
