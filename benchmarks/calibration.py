@@ -12,7 +12,7 @@ import signal
 import statistics
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from record import ROOT, TARGET_GLASS, TARGET_SCENE, machine, print_table, recorded, write_record
+from record import ROOT, TARGET_GLASS, TARGET_SCENE, keep_record, machine, print_table, recorded
 
 from diffdisp import (
     Dielectric,
@@ -149,8 +149,8 @@ def own_core(cores: "multiprocessing.Queue[int]") -> None:
 
 def calibrate(
     case: Case, film: Film, repeats: int, before: list[dict[str, Any]]
-) -> list[dict[str, Any]]:
-    """Figures of the z-scores of one case; Ctrl-C ends it with the fits that are done.
+) -> Iterator[list[dict[str, Any]]]:
+    """Figures of the z-scores of one case, after each fit those of all so far; Ctrl-C ends it.
 
     Args:
         case: the kind of picture.
@@ -179,7 +179,7 @@ def calibrate(
             try:
                 fitted = next(fits)
             except KeyboardInterrupt:
-                break
+                return
             seconds.append(fitted.seconds)
             failed += not fitted.converged
             errors.append(fitted.n_d_std)
@@ -190,28 +190,26 @@ def calibrate(
                 f"{case.name}: {seed + 1} of {repeats}, z {np.mean(n_d):.2f} ± {np.std(n_d):.2f}",
                 file=sys.stderr,
             )
-    if not seconds:
-        return []
-    return [
-        {
-            "case": case.name,
-            "of": name,
-            "mean": float(np.mean(z)),
-            "std": float(np.std(z)),
-            "within_1": float(np.mean(np.abs(z) < 1)),
-            "n_d_std": statistics.median(errors),
-            "size": film.width,
-            "bands": film.channels,
-            "fits": len(found["n_d"]),
-            "failed": failed,
-            "fit_s": statistics.median(seconds),
-            "cores": 1,
-            "date": datetime.now(UTC).date().isoformat(),
-            "z": z,
-        }
-        for name, z in found.items()
-        if z
-    ]
+            yield [
+                {
+                    "case": case.name,
+                    "of": name,
+                    "mean": float(np.mean(z)),
+                    "std": float(np.std(z)),
+                    "within_1": float(np.mean(np.abs(z) < 1)),
+                    "n_d_std": statistics.median(errors),
+                    "size": film.width,
+                    "bands": film.channels,
+                    "fits": len(found["n_d"]),
+                    "failed": failed,
+                    "fit_s": statistics.median(seconds),
+                    "cores": 1,
+                    "date": datetime.now(UTC).date().isoformat(),
+                    "z": list(z),
+                }
+                for name, z in found.items()
+                if z
+            ]
 
 
 def main() -> None:
@@ -226,20 +224,22 @@ def main() -> None:
     options = parser.parse_args()
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
     film = Film(options.size, options.size, band_middles(400.0, 700.0, options.bands))
-    # Hours of work: what is done is kept, whatever becomes of the rest, and until it is done anew.
+    # Hours of work: each fit is kept when it is done, whatever becomes of the rest.
     rows: list[dict[str, Any]] = recorded("calibration")["scores"]
     for case in CASES:
         if options.only and case.name not in options.only:
             continue
         alike = {"case": case.name, "size": options.size, "bands": options.bands}
         before = [row for row in rows if "z" in row and alike.items() <= row.items()]
-        found = calibrate(case, film, options.repeats, before if options.more else [])
+        found: list[dict[str, Any]] = []
+        others = [row for row in rows if row["case"] != case.name]
+        for found in calibrate(case, film, options.repeats, before if options.more else []):
+            rows = others + found
+            keep_record("calibration", vars(options) | {"noise": NOISE}, {"scores": rows})
         if not found:  # stopped before its first fit
             continue
         shown = [{name: x for name, x in row.items() if name != "z"} for row in found]
         print_table(list(shown[0]), [list(row.values()) for row in shown])
-        rows = [row for row in rows if row["case"] != case.name] + found
-        write_record("calibration", vars(options) | {"noise": NOISE}, {"scores": rows})
 
 
 if __name__ == "__main__":

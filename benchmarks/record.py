@@ -50,7 +50,13 @@ def versions() -> dict[str, str]:
 
 
 def write_record(name: str, settings: dict[str, Any], figures: Any) -> None:
-    """Write results/`name`.json.
+    """`keep_record`, and say so."""
+    path = keep_record(name, settings, figures)
+    print(f"written: {path.relative_to(ROOT)}")
+
+
+def keep_record(name: str, settings: dict[str, Any], figures: Any) -> Path:
+    """Write results/`name`.json, whole or not at all.
 
     Args:
         name: of the benchmark.
@@ -66,8 +72,9 @@ def write_record(name: str, settings: dict[str, Any], figures: Any) -> None:
     }
     RESULTS.mkdir(exist_ok=True)
     path = RESULTS / f"{name}.json"
-    path.write_text(json.dumps(record, indent=2, ensure_ascii=False) + "\n")
-    print(f"written: {path.relative_to(ROOT)}")
+    fresh = path.with_suffix(".new")
+    fresh.write_text(json.dumps(record, indent=2, ensure_ascii=False) + "\n")
+    return fresh.replace(path)
 
 
 def recorded(name: str) -> Any:
