@@ -205,7 +205,7 @@ def calibrate(
                     "fit_s": statistics.median(seconds),
                     "cores": 1,
                     "date": datetime.now(UTC).date().isoformat(),
-                    "z": list(z),
+                    "z": [round(x, 4) for x in z],
                 }
                 for name, z in found.items()
                 if z
