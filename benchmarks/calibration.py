@@ -166,7 +166,8 @@ def calibrate(
     found: dict[str, list[float]] = {"n_d": [], "V_d": [], "n": [], "free": []}
     found |= {row["of"]: list(row["z"]) for row in before}
     failed = before[0]["failed"] if before else 0
-    errors, seconds = [], []
+    errors: list[float] = []
+    seconds: list[float] = []
     # A process that is forked from one with threads may hang.
     context = multiprocessing.get_context("spawn")
     count, cores = machine()["cores"], context.Queue()
@@ -190,26 +191,47 @@ def calibrate(
                 f"{case.name}: {seed + 1} of {repeats}, z {np.mean(n_d):.2f} ± {np.std(n_d):.2f}",
                 file=sys.stderr,
             )
-            yield [
-                {
-                    "case": case.name,
-                    "of": name,
-                    "mean": float(np.mean(z)),
-                    "std": float(np.std(z)),
-                    "within_1": float(np.mean(np.abs(z) < 1)),
-                    "n_d_std": statistics.median(errors),
-                    "size": film.width,
-                    "bands": film.channels,
-                    "fits": len(found["n_d"]),
-                    "failed": failed,
-                    "fit_s": statistics.median(seconds),
-                    "cores": 1,
-                    "date": datetime.now(UTC).date().isoformat(),
-                    "z": [round(x, 4) for x in z],
-                }
-                for name, z in found.items()
-                if z
-            ]
+            yield figures(case, film, found, failed, errors, seconds)
+
+
+def figures(
+    case: Case,
+    film: Film,
+    found: dict[str, list[float]],
+    failed: int,
+    errors: list[float],
+    seconds: list[float],
+) -> list[dict[str, Any]]:
+    """A row of the record for each kind of z-score.
+
+    Args:
+        case: the kind of picture.
+        film: its size and bands.
+        found: all z-scores.
+        failed: how many fits say that they have not converged.
+        errors: reported of n_d, in this run.
+        seconds: that fits took, in this run.
+    """
+    return [
+        {
+            "case": case.name,
+            "of": name,
+            "mean": float(np.mean(z)),
+            "std": float(np.std(z)),
+            "within_1": float(np.mean(np.abs(z) < 1)),
+            "n_d_std": statistics.median(errors),
+            "size": film.width,
+            "bands": film.channels,
+            "fits": len(found["n_d"]),
+            "failed": failed,
+            "fit_s": statistics.median(seconds),
+            "cores": 1,
+            "date": datetime.now(UTC).date().isoformat(),
+            "z": [round(x, 4) for x in z],
+        }
+        for name, z in found.items()
+        if z
+    ]
 
 
 def main() -> None:
