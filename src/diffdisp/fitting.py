@@ -153,8 +153,12 @@ UNDERSTATED = " In this scene derivatives do not know how {} move: these errors 
 UNFINISHED = " The fit was stopped: its answer may lie many of these errors away."
 """What has to be said of errors that are those about a point, which is no minimum yet."""
 
-PROFILE = np.arange(-3.0, 4.0)
-"""Places, in errors of n_d, at which the sum of squares is looked at along its way."""
+PROFILE, WIDE_PROFILE = np.arange(-3.0, 4.0), np.arange(-5.0, 6.0)
+"""Places, in errors of n_d, at which the sum of squares is looked at along its way: about where a
+fit ends, and about the truth, from which the noise takes that."""
+
+DRAWS = 4096
+"""Of noise, for what a fit will see there: the mean is then known to less than 1 %."""
 
 POLISH = 6
 """Steps more, at most, where more than the glass is free: a scene's numbers move the picture less
@@ -733,9 +737,11 @@ def expected_uncertainty(
     """What a picture of a scene would tell of a glass ball, before anybody takes it; in float64.
 
     The errors that `fit` would report of such a picture, if it found the scene's own glass: the
-    picture and its slopes there are those of its last level. What so many samples leave open of
-    each pixel counts as noise too; where that is more than the noise, fits report up to 1.6 times
-    these errors (measured on the bench at 32 pixels and a noise of 1e-3; at 64 pixels 1.0).
+    picture and its slopes there are those of its last level. Where numbers of the scene are free,
+    what a fit will see along the way least known is the mean over such noise; the residual of one
+    picture makes its errors a tenth larger or smaller. What so many samples leave open of each
+    pixel counts as noise too; where that is more than the noise, fits report up to 1.6 times these
+    errors (measured on the bench at 32 pixels and a noise of 1e-3; at 64 pixels 1.0).
 
     Args:
         scene: what the picture is to show; the ball's glass in it is what is looked at.
@@ -798,6 +804,10 @@ def _expected(problem: Problem, prior: str, noise: float) -> Uncertainty:
         source += f", with what samples leave open as of {expected.sigma:.2g}"
     expected = expected._replace(source=source)
     opening = "Such a picture would fix"
+    if problem.free.parameters and not _clean(level, lin):
+        here = Descent(at, lin._replace(q=np.zeros_like(lin.q)), 0, True, 0.0, at.z)
+        wider = _wider(problem, level, here, seen.columns)
+        expected = expected._replace(meat=expected.meat + np.multiply.outer(wider, wider))
     told = _uncertainty(problem, at, level, lin, expected, prior, opening)
     return replace(told, noise=noise)
 
@@ -1360,9 +1370,14 @@ def _objective(
     unknowns: Unknowns, lin: Linearised, at: Point, anchor: np.ndarray, noise: float
 ) -> float:
     """What a step has to lower: squared residuals, and what is known besides, in their unit."""
+    return lin.cost + noise**2 * _far(unknowns, at, anchor)
+
+
+def _far(unknowns: Unknowns, at: Point, anchor: np.ndarray) -> float:
+    """Squared distance from what is known besides, in its errors."""
     known = unknowns.prior_rows @ np.asarray(unknowns.coefficients.logarithms(at.z))
     far = np.sum(((at.z - anchor) / WIDEST) ** 2) + np.sum((known - unknowns.prior_mean) ** 2)
-    return lin.cost + noise**2 * float(far)
+    return float(far)
 
 
 class Descent(NamedTuple):
@@ -1979,8 +1994,7 @@ def _search(problem: Problem, target: Picture) -> "tuple[Level, Descent]":
         level, finest = (each._replace(robust=tukey) for each in (level, finest))
         cut = _descend(problem, level, best.at, CUTOFF, 30, small, along)
         best = cut._replace(steps=best.steps + cut.steps)
-    error = best.lin.noise / max(float(np.max(np.abs(best.lin.eliminated().r))), 1e-300)
-    if NEGLECTED * CUTOFF > SMALL_STEP * error and level.drawing is None:
+    if _clean(level, best.lin):
         # So clean a picture shows the light of the paths that were ended early.
         if problem.free.parameters and target.samples is None:
             along = level
@@ -1990,6 +2004,12 @@ def _search(problem: Problem, target: Picture) -> "tuple[Level, Descent]":
         slopes = level if level.drawing is None else _slopes_by_chance(problem, depth, seed)
         best = _polished(problem, finest, slopes, best)
     return finest, best
+
+
+def _clean(level: Level, lin: Linearised) -> bool:
+    """Whether a picture has so little noise that it shows the light of paths ended early."""
+    error = lin.noise / max(float(np.max(np.abs(lin.eliminated().r))), 1e-300)
+    return NEGLECTED * CUTOFF > SMALL_STEP * error and level.drawing is None
 
 
 def _by_chance(problem: Problem) -> bool:
@@ -2050,44 +2070,82 @@ def _polished(problem: Problem, level: Level, slopes: Level, end: Descent) -> De
         Bates and Watts, Nonlinear Regression Analysis and Its Applications (Wiley, 1988), chapter
         6, profiles; the mean in place of the minimum is Bayes' under an even prior.
     """
-    unknowns, free = problem.unknowns, problem.free
     known = _linearise(problem, slopes, end.at, CUTOFF).columns
     best = _descend(problem, level, end.at, CUTOFF, POLISH, SMALL_STEP, known=known)
-    level, lin = _rescaled(level, best.lin, free.brightest)
-    z, steps = jnp.asarray(best.at.z), end.steps + best.steps
-    covariance = _covariance(unknowns, z, lin, lin.noise**2 * lin.white + lin.held, lin.noise)
-    index = unknowns.coefficients.index(z, unknowns.reference)
-    of_index = _along_logs(unknowns.coefficients, lambda z: unknowns.change(z, index), z)
-    of_n_d = _along_logs(
-        unknowns.coefficients, lambda z: _line_figures(unknowns.coefficients, z), z
-    )[0]
-    told = covariance[:, free.total :] @ of_n_d
-    told /= np.sqrt(of_n_d @ told[free.total :])
-    way = lin.r @ np.concatenate([told[: free.total], of_index @ told[free.total :]])
-
-    def moved(places: float) -> tuple[Point, Linearised]:
-        shifted = lin._replace(q=lin.q - places * way)
-        at, _ = _next_point(unknowns, best.at, best.anchor, shifted, 0.0)
-        return at, _linearise(problem, level, at, CUTOFF, known, of_index=True)
-
-    costs = []
+    level, lin = _rescaled(level, best.lin, problem.free.brightest)
+    best = best._replace(lin=lin, steps=end.steps + best.steps, spread=end.spread)
+    way, steps, costs = _least_known(problem, best), best.steps, []
     for place in PROFILE:
-        at, there = moved(place)
-        costs.append(_objective(unknowns, there, at, best.anchor, lin.noise))
+        at, there = _moved(problem, level, best, place * way, known)
+        costs.append(_objective(problem.unknowns, there, at, best.anchor, lin.noise))
         steps += 1
-        problem.progress(steps, there.rms, _n_d(unknowns, at.z))
-    mean, spread = _mean_place(np.array(costs) / lin.noise**2)
-    at, there = moved(mean)
+        problem.progress(steps, there.rms, _n_d(problem.unknowns, at.z))
+    mean, spread = (float(v) for v in _mean_place(np.array(costs) / lin.noise**2))
+    at, there = _moved(problem, level, best, mean * way, known)
     wider = np.sqrt(max(spread**2 - 1, 0.0)) * way
-    return Descent(at, there, steps + 1, True, end.spread, best.anchor, wider)
+    return best._replace(at=at, lin=there, steps=steps + 1, converged=True, wider=wider)
 
 
-def _mean_place(squares: np.ndarray) -> tuple[float, float]:
-    """Mean and standard deviation over `PROFILE`, from squares there in units of the noise's."""
-    likely = np.exp(-(squares - np.min(squares)) / 2)
-    likely /= np.sum(likely)
-    mean = float(likely @ PROFILE)
-    return mean, float(np.sqrt(likely @ (PROFILE - mean) ** 2))
+def _least_known(problem: Problem, end: Descent) -> np.ndarray:
+    """The way (total,) in q that n_d and all else go together, as long as their error."""
+    coefficients, total, lin = problem.unknowns.coefficients, problem.free.total, end.lin
+    z, reference = jnp.asarray(end.at.z), problem.unknowns.reference
+    meat = lin.noise**2 * lin.white + lin.held
+    covariance = _covariance(problem.unknowns, z, lin, meat, lin.noise)
+    index = _along_logs(coefficients, lambda z: coefficients.index(z, reference), z)
+    of_index = problem.unknowns.project @ index
+    of_n_d = _along_logs(coefficients, lambda z: _line_figures(coefficients, z), z)[0]
+    told = covariance[:, total:] @ of_n_d
+    told /= np.sqrt(of_n_d @ told[total:])
+    return np.asarray(lin.r @ np.concatenate([told[:total], of_index @ told[total:]]))
+
+
+def _moved(
+    problem: Problem, level: Level, end: Descent, by: np.ndarray, known: Columns
+) -> tuple[Point, Linearised]:
+    """The point that a change (total,) of q leads to, and the picture there."""
+    shifted = end.lin._replace(q=end.lin.q - by)
+    at, _ = _next_point(problem.unknowns, end.at, end.anchor, shifted, 0.0)
+    return at, _linearise(problem, level, at, CUTOFF, known, of_index=True)
+
+
+def _mean_place(squares: np.ndarray, places: np.ndarray = PROFILE) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation (...) over places, from squares (..., places) there.
+
+    The squares are in units of the noise's.
+    """
+    likely = np.exp(-(squares - np.min(squares, axis=-1, keepdims=True)) / 2)
+    likely /= np.sum(likely, axis=-1, keepdims=True)
+    mean = np.asarray(likely @ places)
+    variance = np.maximum(likely @ places**2 - mean**2, 0.0)
+    return mean, np.asarray(np.sqrt(variance))
+
+
+def _wider(problem: Problem, level: Level, end: Descent, known: Columns) -> np.ndarray:
+    """How far q (total,) is open beside the noise, as `_polished` will see it.
+
+    What that sees depends on the noise. What noise adds to the sums of squares along the way has
+    the products of the pictures' changes there as its covariance, so that any number of draws of
+    noise needs no picture more.
+
+    Args:
+        problem: what stays the same.
+        level: the resolution.
+        end: the point, and the picture there without noise.
+        known: slopes there.
+    """
+    way, pictures, beside = _least_known(problem, end), [], []
+    for place in WIDE_PROFILE:
+        at, there = _moved(problem, level, end, place * way, known)
+        pictures.append(np.ravel(there.picture * np.sqrt(level.weights)) / end.lin.noise)
+        beside.append(_far(problem.unknowns, at, end.anchor))
+    change = np.array(pictures) - pictures[len(pictures) // 2]
+    products = change @ change.T
+    generator = np.random.default_rng(0)
+    noise = generator.standard_normal((DRAWS, len(products))) @ _root(products).T
+    squares = np.diag(products) + np.array(beside) + 2 * noise
+    _, spread = _mean_place(squares, WIDE_PROFILE)
+    return np.asarray(np.sqrt(np.mean(np.maximum(spread**2 - 1, 0.0))) * way)
 
 
 class Noise(NamedTuple):
