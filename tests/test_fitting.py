@@ -32,6 +32,7 @@ from diffdisp.fitting import (
     _more_samples,
     _probabilities,
     _problem,
+    _slopes_by_chance,
     expected_uncertainty,
     fit,
 )
@@ -742,6 +743,34 @@ def test_a_glass_over_a_matte_ground_in_a_picture_of_our_own():
     other = np.asarray(render(on_matte_ground(BK7), film, dtype="float64", **knobs | {"seed": 4}))
     assert result.rms_residual < np.sqrt(np.mean((other - shown) ** 2)) / 4
     assert abs(result.n_d - float(BK7.n_d)) < 4 * result.n_d_std < 3e-4
+
+
+def test_slopes_know_how_the_outline_moves_over_a_matte_ground():
+    # Two by two pixels of the far rim, where the ball shows a border of tiles.
+    narrow = {"look_at": (0.0, 0.676, -0.72), "vertical_fov": 2.29}
+    film = Film(2, 2, FEW_BANDS.wavelengths)
+
+    def rim(x: float) -> Scene:
+        scene = on_matte_ground(BK7)
+        ball, ground = scene.objects
+        shape = replace(ball.shape, center=(x, 0.0, 0.0))
+        objects = (replace(ball, shape=shape), ground)
+        return Scene(replace(scene.camera, **narrow), objects, scene.background)
+
+    step, many = 1e-3, {"samples": 1 << 14, "dtype": "float64"}
+    after, before = (np.asarray(render(rim(x), film, **many)) for x in (step, -step))
+    truth = (after - before).reshape(4, 3) / (2 * step)
+    blank = Picture(np.zeros((2, 2, 3)), film.wavelengths)
+    used, free = np.ones((2, 2), bool), ("ball.center.x",)
+    with jax.enable_x64(True):
+        fixed = used, free, "none", "squares", lambda *_: None
+        problem = _problem(rim(0.0), 0, blank, *fixed)
+        at = Point(problem.unknowns.coefficients.start(), np.zeros(1))
+        slopes = _linearise(problem, _slopes_by_chance(problem, DEPTH, 0), at, CUTOFF)
+        found = slopes.columns.values[:, :, 0].T
+    assert np.max(np.abs(truth)) > 10
+    # 6 % measured; 113 % where the ball's outline is that of points.
+    assert np.linalg.norm(found - truth) < 0.2 * np.linalg.norm(truth)
 
 
 def test_outlines_are_where_a_ball_ends():

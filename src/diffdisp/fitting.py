@@ -1113,7 +1113,7 @@ def _trace(
 
     # A ball's outline moves with it; slopes of points of it are far from a pixel's. Of a picture
     # that is drawn as the target was they are the true ones all the same.
-    soft = part.split > 1 and not part.plan.nested
+    soft = part.plan.scattering or (part.split > 1 and not part.plan.nested)
     plan = replace(part.plan, soft=soft and bool(places))
 
     def trace(chunks: Pixels) -> np.ndarray:

@@ -342,7 +342,8 @@ def nearest(
             if reach is not None:
                 along, depth, edges = sphere_depth(ray, reach, center, radii[place])
                 grazes = (depth <= 0) & (depth + 0.5 * box_width(edges) > 0) & (along > 0)
-                grazes = grazes & ((number < plan.balls) == plan.soft) & (number != last)
+                outlined = jnp.where(number < plan.balls, plan.soft, plan.filtered)
+                grazes = grazes & outlined & (number != last)
                 distance, meets = jnp.where(grazes, along, distance), meets | grazes
             if without is not None:
                 meets = meets & (number != without)
@@ -1333,8 +1334,8 @@ def _one_of_seen(
     """One of the surfaces that a footprint meets, what it counts, and the choices with this one.
 
     Across an outline, and the horizon of a plane, lie two: the nearer one is chosen by the part of
-    the footprint that meets it. The part has a derivative, the chance has none. Outlines of balls
-    are hard.
+    the footprint that meets it. The part has a derivative, the chance has none. A ball of glass is
+    met by all of it or none, also where outlines are soft.
 
     Args:
         ray: the footprint's middle.
@@ -1895,12 +1896,31 @@ def _meet(path: Path, setting: Setting) -> tuple[Vec3, Vec3, Real]:
 
     sphere = once(to_sphere, setting.one) if rows else None
 
+    def to_outline() -> tuple[Array, Vec3]:
+        """Whether a ball's outline is soft, and the offset from its centre."""
+        assert sphere is not None
+        assert path.footprint is not None
+        center, radius, _ = sphere
+        begins = path.last == surface
+        outside = _starts_outside(ray, center, radius)
+        is_soft = (surface < plan.balls) & (begins | outside) & ~_all_zero(path.footprint)
+        width = box_width(sphere_depth(ray, path.footprint, center, radius)[2])
+        # It holds for a whole footprint, and moves next to not at all.
+        width = jax.lax.stop_gradient(width)
+        return is_soft, soft_offset(ray, center, radius, width, begins)
+
+    outline = once(to_outline, setting.one) if plan.balls and plan.soft else None
+
     def meeting() -> tuple[Vec3, Vec3, Real]:
         if sphere is not None:
             center, radius, distance = sphere
             outward = normalize(ray.origin + ray.direction * distance - center)
             # Back onto the sphere: in float32 the ray ends some way off a large one.
             point = center + outward * radius
+            if outline is not None:
+                is_soft, offset = outline
+                soft = center + offset, normalize(offset)
+                point, outward = choose(is_soft, soft, (point, outward))
         if plan.matte_planes + plan.metal_planes:
             plane, on_plane = _plane_row(surface, plan), surface >= rows
             normal = _pick_vector(world.normals, plane)
