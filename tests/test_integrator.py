@@ -22,6 +22,7 @@ from diffdisp.integrator import (
     once,
     paint_table,
     through_ball,
+    unentered,
     world_tables,
 )
 from diffdisp.planning import Plan, make_plan
@@ -244,24 +245,31 @@ def test_a_ball_that_is_not_met_from_outside_in_one_step(center):
 @jax.jit
 def chords(impact, n):
     """The path within the ball alone after each of five bounces."""
-    path = ALONE.bounce(path_at(impact), n, inside=False)
+    path = ALONE.bounce(unentered(path_at(impact)), n, inside=False)
     paths = [path]
     for _ in range(4):
         paths.append(ALONE.bounce(paths[-1], n, inside=True))
     return paths
 
 
-@pytest.mark.parametrize("impact", IMPACTS)
+def within(path):
+    """Where a path within the unit ball is, and its direction."""
+    a, b, r, s = (float(x) for x in path.chord.place)
+    normal, direction = numbers(path.ray.origin), numbers(path.ray.direction)
+    return a * normal + b * direction, r * normal + s * direction
+
+
+@pytest.mark.parametrize("impact", [0.0, 1e-9, *IMPACTS, 1 - 1e-12])
 def test_chords_of_a_ball_alone(impact):
     refraction = np.arcsin(impact / N_D)
     paths = chords(jnp.array(impact), jnp.array(N_D))
-    for path in paths:
-        origin, direction = numbers(path.ray.origin), numbers(path.ray.direction)
+    rays = [within(path) for path in paths]
+    for origin, direction in rays:
         momentum = N_D * np.linalg.norm(np.cross(origin, direction))
         np.testing.assert_allclose(momentum, impact, rtol=0, atol=1e-13)  # rounding, as below
         np.testing.assert_allclose(origin @ direction, -np.cos(refraction), rtol=0, atol=1e-13)
-    for here, there in itertools.pairwise(paths):
-        turn = numbers(here.ray.direction) @ numbers(there.ray.direction)
+    for (_, here), (_, there) in itertools.pairwise(rays):
+        turn = here @ there
         np.testing.assert_allclose(turn, -np.cos(2 * refraction), rtol=0, atol=1e-13)
 
 
@@ -309,7 +317,7 @@ def test_slope_of_the_weights_in_the_index(impact):
 
 def test_the_last_order_ends_the_path():
     shallow = tracer_bench(ball(N_D), depth=3)
-    entered = jax.jit(lambda path: shallow.bounce(path, N_D, inside=False))(path_at(0.5))
+    entered = jax.jit(lambda path: shallow.bounce(path, N_D, inside=False))(unentered(path_at(0.5)))
     assert entered.alive
     ended = jax.jit(lambda path: shallow.bounce(path, N_D, inside=True))(entered)
     assert not ended.alive
@@ -317,7 +325,7 @@ def test_the_last_order_ends_the_path():
 
 
 def test_a_path_that_has_ended_collects_nothing():
-    ended = path_at(jnp.array(0.5))._replace(alive=jnp.array(False))
+    ended = unentered(path_at(jnp.array(0.5))._replace(alive=jnp.array(False)))
     after = jax.jit(lambda path: ALONE.bounce(path, N_D, inside=False))(ended)
     jax.tree.map(np.testing.assert_array_equal, after, ended)
 

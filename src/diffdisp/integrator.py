@@ -90,7 +90,7 @@ class Path(NamedTuple):
     reflected where both ways are taken, 0 if none is followed. `choices` and `lit` are of paths
     that scatter and are differentiated. `stretch` is by what part of itself a step of the film
     turns the camera's ray less from one end of each edge of the footprint to the other; where
-    there are tiles.
+    there are tiles. `chord` is of paths inside the only ball.
     """
 
     ray: Ray
@@ -106,6 +106,39 @@ class Path(NamedTuple):
     choices: "Choices | None" = None
     lit: "Lit | None" = None
     stretch: tuple[Real, Real] | None = None
+    chord: "Chord | None" = None
+
+
+class Chord(NamedTuple):
+    """Where a path is inside the only ball.
+
+    Light that enters a ball stays in the plane of its direction and of the normal there: those are
+    what `Path.ray` holds, and its footprint their changes. The normal wherever it meets the ball
+    later, and its direction, are so much of the one and so much of the other, by numbers that
+    depend on the cosine at which it entered, and on nothing else of the ray. So are derivatives:
+    what would be a dozen numbers of a footprint is one for each of these.
+
+    Args:
+        cosine: to the ball, outside of it, ≥ 0.
+        tilts: its changes along both edges of the footprint.
+        inner: the same cosine inside.
+        bend: derivative of `inner` in `cosine`.
+        share: of the light that the surface reflects, from either side.
+        place: so much of both is the normal where the path was last, and so much its direction.
+        turns: derivatives of `place` in `cosine`.
+        size: radius of the ball on which the path lies.
+        swells: its changes along both edges.
+    """
+
+    cosine: Real
+    tilts: tuple[Real, Real]
+    inner: Real
+    bend: Real
+    share: Real
+    place: tuple[Real, Real, Real, Real]
+    turns: tuple[Real, Real, Real, Real]
+    size: Real
+    swells: tuple[Real, Real]
 
 
 class Choices(NamedTuple):
@@ -1023,11 +1056,14 @@ def bounce(path: Path, setting: Setting, inside: bool | None = None) -> Path:
     Args:
         path: a path on its way to a surface that sends it on.
         setting: the rest.
-        inside: whether the path is inside its ball, where that is known of all paths.
+        inside: whether the path is inside its ball, where that is known of all paths: those of a
+            ball apart from all other glass, which have room for a chord.
     """
     if setting.plan.scattering:
         return _one_way(path, setting)
-    return _both_ways(path, setting, path.last == path.surface if inside is None else inside)
+    if inside is None:
+        return _both_ways(path, setting, path.last == path.surface)
+    return _along_chord(path, setting) if inside else _enter(path, setting)
 
 
 class Way(NamedTuple):
@@ -1040,25 +1076,14 @@ class Way(NamedTuple):
 
 def _both_ways(path: Path, setting: Setting, inside: Array | bool) -> Path:
     """A bounce in a scene that sends paths on only from glass: two ways, chosen at the end."""
-    plan, world, ball = setting.plan, setting.tables.world, path.surface
+    plan, ball = setting.plan, path.surface
     outer, inner, differ = _parting(path, setting, inside)
-    throughput, spheres = path.throughput[0], all_spheres(world, plan, setting.one)
-    # What leaves the only ball meets no glass again.
-    alone = plan.balls == 1 and not plan.nested
-
-    def arrive(way: Way, radiance: Channels) -> tuple[Array, Channels]:
-        """The surface that a way meets, and the radiance with what that one adds."""
-        surface = nearest(way.ray, world, plan, ball, spheres, way.footprint)
-        arrived = path._replace(ray=way.ray, footprint=way.footprint)
-        light = arriving(surface, arrived, setting.tables, plan, setting.one, alone)
-        factor = jnp.where(path.alive & (surface >= plan.first_lamp), throughput * way.share, 0.0)
-        return surface, tuple(r + factor * x for r, x in zip(radiance, light, strict=True))
-
-    outer_surface, radiance = arrive(outer, path.radiance)
+    throughput = path.throughput[0]
+    outer_surface, radiance = _arrive(outer, path, path.radiance, setting, False)
     outer_goes = (outer_surface < plan.first_lamp) & (outer.share > 0)
     inner_goes, inner_surface = inner.share > 0, ball
     if plan.nested:
-        inner_surface, radiance = arrive(inner, radiance)
+        inner_surface, radiance = _arrive(inner, path, radiance, setting, False)
         inner_goes = inner_goes & (inner_surface < plan.first_lamp)
 
     way, goes_on, surface = inner, inner_goes, inner_surface
@@ -1080,8 +1105,153 @@ def _both_ways(path: Path, setting: Setting, inside: Array | bool) -> Path:
     return _go_on(path, moved, goes_on, differ, radiance, setting)
 
 
-def _parting(path: Path, setting: Setting, inside: Array | bool) -> tuple[Way, Way, Array]:
-    """The outer and the inner way from a glass surface, and whether it is an interface.
+def _arrive(
+    way: Way, path: Path, radiance: Channels, setting: Setting, clear: bool
+) -> tuple[Array, Channels]:
+    """The surface that a way meets, and the radiance with what that one adds.
+
+    Args:
+        way: from the ball that the path is at.
+        path: as it came there.
+        radiance: of the path by then.
+        setting: the rest.
+        clear: whether the way is known to meet no glass.
+    """
+    plan, world = setting.plan, setting.tables.world
+    spheres = all_spheres(world, plan, setting.one)
+    surface = nearest(way.ray, world, plan, path.surface, spheres, way.footprint)
+    arrived = path._replace(ray=way.ray, footprint=way.footprint)
+    light = arriving(surface, arrived, setting.tables, plan, setting.one, clear)
+    factor = path.throughput[0] * way.share
+    factor = jnp.where(path.alive & (surface >= plan.first_lamp), factor, 0.0)
+    return surface, tuple(r + factor * x for r, x in zip(radiance, light, strict=True))
+
+
+def unentered(path: Path) -> Path:
+    """The same, with room for a chord."""
+    zero = jnp.zeros_like(path.ray.direction.x)
+    two, four = (zero,) * 2, (zero,) * 4
+    return path._replace(chord=Chord(zero, two, zero, zero, zero, four, four, zero, two))
+
+
+def _enter(path: Path, setting: Setting) -> Path:
+    """A path, with room for a chord, into the only ball, beside which there is no other glass."""
+    ball = path.surface
+    assert path.footprint is not None
+    old, changes = path.ray.direction, tuple(edge.direction for edge in path.footprint)
+    foot = _facing(path, setting, False)
+    center, index = _pick_vector(setting.tables.world.centers, ball), setting.index_of(ball)
+
+    def light() -> tuple[Real, ...]:
+        """Cosines outside and inside, the derivative of this in that, one over the index, share."""
+        cos_i = jnp.abs(foot.cosine)
+        cos_t, slower = cos_transmitted(cos_i, index), inverse(index)
+        bend = cos_i * (slower * slower) * inverse(jnp.where(cos_t > 0, cos_t, 1.0))
+        return cos_i, cos_t, bend, slower, fresnel_reflectance(cos_i, cos_t, index)
+
+    cos_i, cos_t, bend, slower, share = once(light, setting.one)
+    tilts = tuple(jnp.where(foot.cosine > 0, tilt, -tilt) for tilt in foot.tilts)
+
+    def mirror() -> tuple[Vec3, tuple[Ray, ...]]:
+        edges = zip(foot.moves, changes, foot.turns, tilts, strict=True)
+        return old + foot.outward * (2.0 * cos_i), tuple(
+            Ray(move, change + turn * (2.0 * cos_i) + foot.outward * (2.0 * tilt))
+            for move, change, turn, tilt in edges
+        )
+
+    mirrored, (across, down) = once(mirror, setting.one)
+    way = Way(Ray(center + foot.offset, mirrored), (across, down), share)
+    _, radiance = _arrive(way, path, path.radiance, setting, True)
+    zero = jnp.zeros_like(cos_i)
+    along = [vector.dot(foot.outward) for vector in (foot.offset, *foot.moves)]
+    chord = Chord(
+        cos_i,
+        (tilts[0], tilts[1]),
+        cos_t,
+        bend,
+        share,
+        (jnp.ones_like(cos_i), zero, cos_i * slower - cos_t, slower + zero),
+        (zero, zero, slower - bend, zero),
+        along[0],
+        (along[1], along[2]),
+    )
+    turned, other = (Ray(turn, change) for turn, change in zip(foot.turns, changes, strict=True))
+    moved = path._replace(
+        ray=Ray(foot.outward, old),
+        footprint=(turned, other),
+        last=ball,
+        throughput=(path.throughput[0] * (1.0 - share),),
+        chord=chord,
+    )
+    return _go_on(path, moved, share < 1, jnp.ones(share.shape, bool), radiance, setting)
+
+
+def _along_chord(path: Path, setting: Setting) -> Path:
+    """A path inside the only ball to where it meets it next: what leaves there, and what stays."""
+    ball, chord, edges = path.surface, path.chord, path.footprint
+    assert chord is not None
+    assert edges is not None
+    center, index = _pick_vector(setting.tables.world.centers, ball), setting.index_of(ball)
+
+    def onward(given: Any) -> tuple[Real, ...]:
+        """The place there, and what of normal and direction at the entrance makes the way out."""
+        inner, cosine, (a, b, r, s) = given
+        twice, less = 2.0 * inner, cosine - index * inner
+        a, b = a + twice * r, b + twice * s
+        return a, b, r - twice * a, s - twice * b, index * r + less * a, index * s + less * b
+
+    given = chord.inner, chord.cosine, chord.place
+    in_cosine = chord.bend, jnp.ones_like(chord.cosine), chord.turns
+    (a, b, r, s, *out), (turns,) = once(lambda: pushed(onward, given, (in_cosine,)), setting.one)
+    normal, direction = path.ray
+
+    def leaving() -> tuple[Ray, tuple[Ray, ...]]:
+        outward, left = (normal * x + direction * y for x, y in ((a, b), out))
+        rates = [normal * x + direction * y for x, y in (turns[:2], turns[4:])]
+
+        def pushed_out(edge: Ray, tilt: Real, swell: Real) -> Ray:
+            turn, change = (
+                edge.origin * x + edge.direction * y + rate * tilt
+                for (x, y), rate in zip(((a, b), out), rates, strict=True)
+            )
+            return Ray(turn * chord.size + outward * swell, change)
+
+        each = zip(edges, chord.tilts, chord.swells, strict=True)
+        return Ray(center + outward * chord.size, left), tuple(pushed_out(*edge) for edge in each)
+
+    ray, (across, down) = once(leaving, setting.one)
+    way = Way(ray, (across, down), 1.0 - chord.share)
+    _, radiance = _arrive(way, path, path.radiance, setting, True)
+    moved = path._replace(
+        throughput=(path.throughput[0] * chord.share,),
+        chord=chord._replace(place=(a, b, r, s), turns=turns[:4]),
+    )
+    everywhere = jnp.ones(path.alive.shape, bool)
+    return _go_on(path, moved, everywhere, everywhere, radiance, setting)
+
+
+class Foot(NamedTuple):
+    """Where a footprint meets a ball: each with its changes along both edges.
+
+    Args:
+        offset: from the ball's centre to there.
+        moves: of the offset.
+        outward: the normal.
+        turns: of the normal.
+        cosine: of the path's direction and the normal.
+        tilts: of the cosine.
+    """
+
+    offset: Vec3
+    moves: tuple[Vec3, ...]
+    outward: Vec3
+    turns: tuple[Vec3, ...]
+    cosine: Real
+    tilts: tuple[Real, ...]
+
+
+def _facing(path: Path, setting: Setting, inside: Array | bool) -> Foot:
+    """Where a path meets its ball.
 
     In stages, each computed once: in one, the fusing compiler would compute the whole again for
     each of the footprint's numbers.
@@ -1114,6 +1284,20 @@ def _parting(path: Path, setting: Setting, inside: Array | bool) -> tuple[Way, W
         offset, moves = outward * radius, tuple(turn * radius for turn in turns)
     both_turn = tuple(zip(changes, turns, strict=True))
     cosine, tilts = stage(lambda vectors: vectors[0].dot(vectors[1]), (old, outward), *both_turn)
+    return Foot(offset, moves, outward, turns, cosine, tilts)
+
+
+def _parting(path: Path, setting: Setting, inside: Array | bool) -> tuple[Way, Way, Array]:
+    """The outer and the inner way from a glass surface, and whether it is an interface."""
+    plan, world, ball = setting.plan, setting.tables.world, path.surface
+    center, radius = _pick_vector(world.centers, ball), _pick(world.radii, ball)
+
+    def stage(of: Callable[[Any], Any], value: Any, *edges: Any) -> tuple[Any, Any]:
+        return once(lambda: pushed(of, value, edges), setting.one)
+
+    assert path.footprint is not None
+    old, changes = path.ray.direction, tuple(edge.direction for edge in path.footprint)
+    offset, moves, outward, turns, cosine, tilts = _facing(path, setting, inside)
     # A border within glass, or a camera there, shows its side only here.
     leaves = cosine > 0 if plan.nested else inside
     on_ball = center + outward * radius
@@ -1183,8 +1367,6 @@ def _distance_to_ball(
 ) -> Real:
     """Distance to the ball that the path is known to meet next."""
     across = -2.0 * (ray.origin - center).dot(ray.direction)
-    if inside is True:
-        return across
     near, far, _ = sphere_distances(ray, center, radius)
     ahead = jnp.where(near > 0, near, far) if plan.nested else near
     return choose(inside, across, ahead)
@@ -2294,7 +2476,7 @@ def _to_the_end(
         ended = loop(None, every_path(None), flat, plan)
     else:
         # One ball apart from all else is entered once; after that its paths stay inside.
-        ended = loop(every_path(False), every_path(True), flat, plan)
+        ended = loop(every_path(False), every_path(True), unentered(flat), plan)
     if plan.filtered:
         lanes_of = np.arange(waves * samples * pixels, dtype=np.int32)
         together = sharing(samples)
