@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from helpers import AIR, N_D, ball, deviation, furnace, numbers, reflectance
 
+from diffdisp import integrator
 from diffdisp.camera import project
 from diffdisp.dispersion import LINE_C, LINE_D, LINE_F
 from diffdisp.film import Film
@@ -271,6 +272,35 @@ def test_chords_of_a_ball_alone(impact):
     for (_, here), (_, there) in itertools.pairwise(rays):
         turn = here @ there
         np.testing.assert_allclose(turn, -np.cos(2 * refraction), rtol=0, atol=1e-13)
+
+
+EDGES = (
+    Ray(vec3(jnp.array([0.3, 0.1, 0.0])), vec3(jnp.array([0.02, -0.01, 0.0]))),
+    Ray(vec3(jnp.array([-0.1, 0.2, 0.0])), vec3(jnp.array([0.0, 0.03, 0.0]))),
+)
+
+
+@pytest.mark.parametrize("impact", [1e-9, *IMPACTS])
+def test_footprints_of_what_leaves_a_ball_alone(impact, monkeypatch):
+    ways = []
+
+    def arrive(way, path, radiance, *_):
+        ways.append(way)
+        return path.surface, radiance
+
+    monkeypatch.setattr(integrator, "_arrive", arrive)
+    path = unentered(path_at(impact)._replace(footprint=EDGES))
+    for order in range(-1, 4):
+        path = ALONE.bounce(path, jnp.array(N_D), inside=order >= 0)
+
+        def left(ray, order=order):
+            place = jnp.array(order + 2)
+            return through_ball(ray, ORIGIN, jnp.array(1.0), jnp.array(N_D), place)[0]
+
+        for edge, found in zip(EDGES, ways[-1].footprint, strict=True):
+            _, expected = jax.jvp(left, (path_at(impact).ray,), (edge,))
+            for one, other in zip(found, expected, strict=True):
+                np.testing.assert_allclose(numbers(one), numbers(other), rtol=0, atol=1e-10)
 
 
 @pytest.mark.parametrize("impact", IMPACTS)
