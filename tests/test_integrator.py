@@ -1,4 +1,5 @@
 import itertools
+from dataclasses import replace
 from pathlib import Path as FilePath
 from typing import NamedTuple
 
@@ -280,15 +281,21 @@ EDGES = (
 )
 
 
-@pytest.mark.parametrize("impact", [1e-9, *IMPACTS])
-def test_footprints_of_what_leaves_a_ball_alone(impact, monkeypatch):
-    ways = []
+@pytest.fixture
+def ways(monkeypatch):
+    """Ways from a ball, as bounces send them out."""
+    found = []
 
     def arrive(way, path, radiance, *_):
-        ways.append(way)
+        found.append(way)
         return path.surface, radiance
 
     monkeypatch.setattr(integrator, "_arrive", arrive)
+    return found
+
+
+@pytest.mark.parametrize("impact", [1e-9, *IMPACTS])
+def test_footprints_of_what_leaves_a_ball_alone(impact, ways):
     path = unentered(path_at(impact)._replace(footprint=EDGES))
     for order in range(-1, 4):
         path = ALONE.bounce(path, jnp.array(N_D), inside=order >= 0)
@@ -301,6 +308,24 @@ def test_footprints_of_what_leaves_a_ball_alone(impact, monkeypatch):
             _, expected = jax.jvp(left, (path_at(impact).ray,), (edge,))
             for one, other in zip(found, expected, strict=True):
                 np.testing.assert_allclose(numbers(one), numbers(other), rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("impact", [0.5, 0.95, 1.02])
+def test_soft_outlines_of_a_ball_alone_and_among_others(impact, ways):
+    soft = ALONE._replace(plan=replace(ALONE.plan, soft=True))
+    entered = path_at(impact)._replace(footprint=EDGES)
+    inner, chord = entered, unentered(entered)
+    for order in range(-1, 3):
+        inner, chord = (
+            soft.bounce(inner, jnp.array(N_D)),
+            soft.bounce(chord, jnp.array(N_D), inside=order >= 0),
+        )
+        among, alone = ways[-2:]
+        jax.tree.map(
+            lambda one, other: np.testing.assert_allclose(one, other, rtol=0, atol=1e-11),
+            alone,
+            among,
+        )
 
 
 @pytest.mark.parametrize("impact", IMPACTS)

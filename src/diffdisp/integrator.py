@@ -441,6 +441,13 @@ def pushed(of: Callable[[Any], Any], value: Any, edges: Any) -> tuple[Any, Any]:
     return result, tuple(push(edge) for edge in edges)
 
 
+def _staged(
+    one: Array | None, of: Callable[[Any], Any], value: Any, *edges: Any
+) -> tuple[Any, Any]:
+    """`pushed`, computed once; `one` is as in `once`."""
+    return once(lambda: pushed(of, value, edges), one)
+
+
 def painted(
     surface: Array,
     path: Path,
@@ -537,7 +544,7 @@ def _filtered_tiles(
         bends: as `_bends` tells; what is divided is the edge along which that is more.
         one: as in `once`.
     """
-    values, reaches = once(lambda: pushed(coordinates, met, edges), one)
+    values, reaches = _staged(one, coordinates, met, *edges)
     swap = jnp.abs(bends[1]) > jnp.abs(bends[0])
     (bend, aside), (along, beside) = choose(
         swap, (bends[::-1], reaches[::-1]), (bends, tuple(reaches))
@@ -591,7 +598,7 @@ def _filtered_cubes(
     That of three waves at once, by those of two at a time, as if no three went together: exact
     where no more than two of them change within the footprint.
     """
-    values, reaches = once(lambda: pushed(coordinates, met, edges), one)
+    values, reaches = _staged(one, coordinates, met, *edges)
     axes = list(zip(values, *reaches, strict=True))
     alone = once(lambda: [filtered_square_wave(*axis) for axis in axes], one)
     mean: Real = -2.0 * alone[0] * alone[1] * alone[2]
@@ -662,7 +669,7 @@ def emitted(
             True,
             one,
         )
-    distance, gains = once(lambda: pushed(reach, path.ray, path.footprint), one)
+    distance, gains = _staged(one, reach, path.ray, *path.footprint)
     across, down = zip(path.footprint, gains, strict=True)
     met, edges = (path.ray, distance), (across, down)
     return painted(surface, path, point, met, edges, tables, plan, True, one)
@@ -1062,7 +1069,7 @@ def bounce(path: Path, setting: Setting, inside: bool | None = None) -> Path:
     if setting.plan.scattering:
         return _one_way(path, setting)
     if inside is None:
-        return _both_ways(path, setting, path.last == path.surface)
+        return _both_ways(path, setting)
     return _along_chord(path, setting) if inside else _enter(path, setting)
 
 
@@ -1074,10 +1081,10 @@ class Way(NamedTuple):
     share: Real
 
 
-def _both_ways(path: Path, setting: Setting, inside: Array | bool) -> Path:
+def _both_ways(path: Path, setting: Setting) -> Path:
     """A bounce in a scene that sends paths on only from glass: two ways, chosen at the end."""
     plan, ball = setting.plan, path.surface
-    outer, inner, differ = _parting(path, setting, inside)
+    outer, inner, differ = _parting(path, setting)
     throughput = path.throughput[0]
     outer_surface, radiance = _arrive(outer, path, path.radiance, setting, False)
     outer_goes = (outer_surface < plan.first_lamp) & (outer.share > 0)
@@ -1142,38 +1149,39 @@ def _enter(path: Path, setting: Setting) -> Path:
     foot = _facing(path, setting, False)
     center, index = _pick_vector(setting.tables.world.centers, ball), setting.index_of(ball)
 
-    def light() -> tuple[Real, ...]:
-        """Cosines outside and inside, the derivative of this in that, one over the index, share."""
-        cos_i = jnp.abs(foot.cosine)
-        cos_t, slower = cos_transmitted(cos_i, index), inverse(index)
-        bend = cos_i * (slower * slower) * inverse(jnp.where(cos_t > 0, cos_t, 1.0))
-        return cos_i, cos_t, bend, slower, fresnel_reflectance(cos_i, cos_t, index)
+    stage = partial(_staged, setting.one)
+    cos_i, tilts = stage(jnp.abs, foot.cosine, *foot.tilts)
 
-    cos_i, cos_t, bend, slower, share = once(light, setting.one)
-    tilts = tuple(jnp.where(foot.cosine > 0, tilt, -tilt) for tilt in foot.tilts)
+    def entering(cos_i: Real) -> tuple[Real, ...]:
+        """The cosine inside; of the normal and of the direction before, what is the one there."""
+        cos_t = cos_transmitted(cos_i, index)
+        slower, weight = refraction(cos_i, cos_t, index)
+        return cos_t, weight, slower
 
-    def mirror() -> tuple[Vec3, tuple[Ray, ...]]:
-        edges = zip(foot.moves, changes, foot.turns, tilts, strict=True)
-        return old + foot.outward * (2.0 * cos_i), tuple(
-            Ray(move, change + turn * (2.0 * cos_i) + foot.outward * (2.0 * tilt))
-            for move, change, turn, tilt in edges
-        )
+    unit, zero = jnp.ones_like(cos_i), jnp.zeros_like(cos_i)
+    (cos_t, weight, slower), ((bend, turn, _),) = stage(entering, cos_i, unit)
+    share = once(lambda: fresnel_reflectance(cos_i, cos_t, index), setting.one)
 
-    mirrored, (across, down) = once(mirror, setting.one)
-    way = Way(Ray(center + foot.offset, mirrored), (across, down), share)
+    def mirrored(given: tuple[Vec3, Vec3, Real]) -> Vec3:
+        old, outward, cos_i = given
+        return old + outward * reflection(cos_i)[1]
+
+    pushes = zip(changes, foot.turns, tilts, strict=True)
+    outer, swings = stage(mirrored, (old, foot.outward, cos_i), *pushes)
+    across, down = (Ray(move, swing) for move, swing in zip(foot.moves, swings, strict=True))
+    way = Way(Ray(center + foot.offset, outer), (across, down), share)
     _, radiance = _arrive(way, path, path.radiance, setting, True)
-    zero = jnp.zeros_like(cos_i)
-    along = [vector.dot(foot.outward) for vector in (foot.offset, *foot.moves)]
+    size, *swells = (vector.dot(foot.outward) for vector in (foot.offset, *foot.moves))
     chord = Chord(
         cos_i,
-        (tilts[0], tilts[1]),
+        tilts,
         cos_t,
         bend,
         share,
-        (jnp.ones_like(cos_i), zero, cos_i * slower - cos_t, slower + zero),
-        (zero, zero, slower - bend, zero),
-        along[0],
-        (along[1], along[2]),
+        (unit, zero, weight, slower + zero),
+        (zero, zero, turn, zero),
+        size,
+        (swells[0], swells[1]),
     )
     turned, other = (Ray(turn, change) for turn, change in zip(foot.turns, changes, strict=True))
     moved = path._replace(
@@ -1202,7 +1210,7 @@ def _along_chord(path: Path, setting: Setting) -> Path:
 
     given = chord.inner, chord.cosine, chord.place
     in_cosine = chord.bend, jnp.ones_like(chord.cosine), chord.turns
-    (a, b, r, s, *out), (turns,) = once(lambda: pushed(onward, given, (in_cosine,)), setting.one)
+    (a, b, r, s, *out), (turns,) = _staged(setting.one, onward, given, in_cosine)
     normal, direction = path.ray
 
     def leaving() -> tuple[Ray, tuple[Ray, ...]]:
@@ -1260,9 +1268,7 @@ def _facing(path: Path, setting: Setting, inside: Array | bool) -> Foot:
     center, radius = _pick_vector(world.centers, ball), _pick(world.radii, ball)
     assert path.footprint is not None
 
-    def stage(of: Callable[[Any], Any], value: Any, *edges: Any) -> tuple[Any, Any]:
-        return once(lambda: pushed(of, value, edges), setting.one)
-
+    stage = partial(_staged, setting.one)
     old, changes = path.ray.direction, tuple(edge.direction for edge in path.footprint)
     if plan.soft:
         width = box_width(sphere_depth(path.ray, path.footprint, center, radius)[2])
@@ -1287,17 +1293,15 @@ def _facing(path: Path, setting: Setting, inside: Array | bool) -> Foot:
     return Foot(offset, moves, outward, turns, cosine, tilts)
 
 
-def _parting(path: Path, setting: Setting, inside: Array | bool) -> tuple[Way, Way, Array]:
+def _parting(path: Path, setting: Setting) -> tuple[Way, Way, Array]:
     """The outer and the inner way from a glass surface, and whether it is an interface."""
     plan, world, ball = setting.plan, setting.tables.world, path.surface
     center, radius = _pick_vector(world.centers, ball), _pick(world.radii, ball)
-
-    def stage(of: Callable[[Any], Any], value: Any, *edges: Any) -> tuple[Any, Any]:
-        return once(lambda: pushed(of, value, edges), setting.one)
-
     assert path.footprint is not None
     old, changes = path.ray.direction, tuple(edge.direction for edge in path.footprint)
+    inside = path.last == ball
     offset, moves, outward, turns, cosine, tilts = _facing(path, setting, inside)
+    stage = partial(_staged, setting.one)
     # A border within glass, or a camera there, shows its side only here.
     leaves = cosine > 0 if plan.nested else inside
     on_ball = center + outward * radius
