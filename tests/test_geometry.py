@@ -16,6 +16,15 @@ from diffdisp.geometry import (
 from diffdisp.vector import Vec3, normalize, vec3
 
 RNG = np.random.default_rng(1)
+FIRST = RNG.bit_generator.state
+
+
+@pytest.fixture(autouse=True)
+def same_numbers():
+    """Every test begins with the same random numbers, whichever ran before it."""
+    RNG.bit_generator.state = FIRST
+
+
 BESIDE = Vec3(*jnp.array([0.0, 0.0, -5.0]))
 
 

@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 
 from diffdisp.dispersion import real_array
@@ -55,6 +56,7 @@ def as_texture(value: Any) -> Texture:
     return Solid(value)
 
 
+@jax.custom_jvp
 def filtered_square_wave(x: Real, across: Real, down: Real) -> Real:
     """Mean of a square wave under two boxes convolved: the marginal of a parallelogram.
 
@@ -69,8 +71,61 @@ def filtered_square_wave(x: Real, across: Real, down: Real) -> Real:
         The mean, within [-1, 1]; its derivatives are finite everywhere and continuous but where
         a footprint begins to touch a second edge.
     """
+    return _mean_wave(x, _boxes(across, down))
+
+
+@filtered_square_wave.defjvp
+def _filtered_square_wave_jvp(
+    primals: tuple[Real, Real, Real], tangents: tuple[Real, Real, Real]
+) -> tuple[Real, Real]:
+    """The slope in closed form, which takes a fraction of what following the mean's steps does."""
+    x, across, down = primals
+    move, *changes = tangents
+    widens, other = (
+        jnp.where(edge < 0, -change, change)
+        for edge, change in zip((across, down), changes, strict=True)
+    )
     boxes = _boxes(across, down)
-    return jnp.where(boxes.wide + boxes.narrow <= 1.0, _near_edge(x, boxes), _many_edges(x, boxes))
+    widens, other = choose(jnp.abs(down) > jnp.abs(across), (other, widens), (widens, other))
+    sliver = jnp.minimum(jnp.abs(across), jnp.abs(down)) <= SLIVER * boxes.wide
+    grows = jnp.where(sliver, SLIVER * widens, other)
+    mean = _mean_wave(x, boxes)
+    many = _slope_of_many(x, move, boxes, widens, grows, mean)
+    near = _slope_near(x, move, boxes, widens, grows)
+    return mean, jnp.where(boxes.wide + boxes.narrow <= 1.0, near, many)
+
+
+def _slope_near(x: Real, move: Real, boxes: "_Boxes", widens: Real, grows: Real) -> Real:
+    """That of the mean where one edge is met at most, with these changes of its place and boxes."""
+    wide, narrow, of_wide, of_narrow = boxes
+    edge = jnp.round(x)
+    offset = x - edge
+    distance, away = jnp.abs(offset), jnp.where(offset < 0, -move, move)
+    over = distance - 0.5 * (wide - narrow)
+    # Of the narrow box this part is on the far side of the edge.
+    part = jnp.maximum(over, 0.0) * of_narrow
+    further = away - 0.5 * (widens - grows)
+    slope = 2.0 * away - part * (2.0 * further - part * grows)
+    slope = (slope - (2.0 * distance - part * part * narrow) * (of_wide * widens)) * of_wide
+    rising = 1.0 - 2.0 * jnp.abs(edge - 2.0 * jnp.round(0.5 * edge))
+    slope = jnp.where(over < narrow, rising * slope, 0.0)
+    return jnp.where(offset < 0, -slope, slope)
+
+
+def _slope_of_many(
+    x: Real, move: Real, boxes: "_Boxes", widens: Real, grows: Real, mean: Real
+) -> Real:
+    """The same wherever. The mean is a second difference; this is one of the integrated wave."""
+    wide, narrow, of_wide, of_narrow = boxes
+    x = x - 2.0 * jnp.round(0.5 * x)
+    total = 0.0 * x
+    for end in (0.5, -0.5):
+        for side in (0.5, -0.5):
+            place = x + (end * wide + side * narrow)
+            height = jnp.abs(place - 2.0 * jnp.round(0.5 * place))
+            term = height * (move + (end * widens + side * grows))
+            total = total + term if end == side else total - term
+    return total * (of_wide * of_narrow) - mean * (of_wide * widens + of_narrow * grows)
 
 
 def filtered_tiles(middle: Pair, across: Pair, down: Pair) -> Real:
@@ -94,12 +149,7 @@ def filtered_tiles(middle: Pair, across: Pair, down: Pair) -> Real:
 
 
 def _around_corner(middle: Pair, across: Pair, down: Pair) -> Real:
-    """The mean of the product of both signs about the nearest corner of four tiles.
-
-    By Green's theorem: the product is constant along rays from the corner, so the integral of it
-    over the parallelogram is half of that of it times (x dy - y dx) along the border, and
-    x dy - y dx is constant on each edge.
-    """
+    """The mean of the product of both signs about the nearest corner of four tiles."""
     corner = [jnp.round(x) for x in middle]
     cells = corner[0] + corner[1]
     even = 1.0 - 2.0 * jnp.abs(cells - 2.0 * jnp.round(0.5 * cells))
@@ -107,26 +157,94 @@ def _around_corner(middle: Pair, across: Pair, down: Pair) -> Real:
     swap = _dot(down, down) > _dot(across, across)
     long, short = choose(swap, (down, across), (across, down))
     square, area = _dot(long, long), _cross(long, short)
-    point = square <= 0
-    size = jnp.where(point, 1.0, square)
+    size = jnp.where(square <= 0, 1.0, square)
     wider = jnp.maximum(SLIVER - jnp.abs(area) * inverse(size), 0.0)
     wider = jnp.where(area < 0, -wider, wider)
     short = (short[0] - wider * long[1], short[1] + wider * long[0])
-    area = jnp.where(point, 1.0, area + wider * square)
-    mean, tilt = 0.0 * at[0], 0.0 * at[0]
-    for edge, other in ((long, short), (short, long)):
-        first, second = (
-            _product_along((at[0] + sign * other[0], at[1] + sign * other[1]), edge)
-            for sign in (-0.5, 0.5)
+    return even * _product_over(at, long, short)
+
+
+@jax.custom_jvp
+def _product_over(at: Pair, long: Pair, short: Pair) -> Real:
+    """Mean of the product of both coordinates' signs over a parallelogram.
+
+    By Green's theorem: the product is constant along rays from the corner, so the integral of it
+    over the parallelogram is half of that of it times (x dy - y dx) along the border, and
+    x dy - y dx is constant on each edge.
+
+    Args:
+        at: its middle.
+        long: one of its edges.
+        short: the other.
+    """
+    return _mean_of(_sides(at, long, short), _over_edges(at, long, short))
+
+
+@_product_over.defjvp
+def _product_over_jvp(
+    primals: tuple[Pair, Pair, Pair], tangents: tuple[Pair, Pair, Pair]
+) -> tuple[Real, Real]:
+    """What the means along the sides tell of the slopes: what crosses a side counts as it does.
+
+    With p + s·long + t·short a point, and a change of it made up of both edges, the integral over
+    one of s and t is that of a derivative; where the change grows with s or t itself, by parts.
+    """
+    _, long, short = primals
+    sides = _sides(*primals)
+    along, aside = sides
+    mean = _mean_of(sides, _over_edges(*primals))
+    (move_long, move_short), (long_long, long_short), (short_long, short_short) = (
+        _over_edges(change, long, short) for change in tangents
+    )
+    slope = (
+        move_long * (aside[1].mean - aside[0].mean)
+        + move_short * (along[1].mean - along[0].mean)
+        + long_long * (0.5 * (aside[0].mean + aside[1].mean) - mean)
+        + long_short * (along[1].moment - along[0].moment)
+        + short_long * (aside[1].moment - aside[0].moment)
+        + short_short * (0.5 * (along[0].mean + along[1].mean) - mean)
+    )
+    return mean, slope
+
+
+class _Side(NamedTuple):
+    """Mean of the product of both signs along a line, and of that times the place from -½ to ½."""
+
+    mean: Real
+    moment: Real
+
+
+_Sides = tuple[tuple[_Side, _Side], tuple[_Side, _Side]]
+"""Of a parallelogram: those along its one edge, before and after its middle; then the others."""
+
+
+def _sides(at: Pair, long: Pair, short: Pair) -> _Sides:
+    before, after = (
+        (
+            _along((at[0] + sign * short[0], at[1] + sign * short[1]), long),
+            _along((at[0] + sign * long[0], at[1] + sign * long[1]), short),
         )
-        mean = mean + 0.25 * (first + second)
-        turn = -1.0 if edge is short else 1.0
-        tilt = tilt + turn * _cross(at, edge) * (first - second)
-    return even * (mean + 0.5 * tilt * inverse(area))
+        for sign in (-0.5, 0.5)
+    )
+    return (before[0], after[0]), (before[1], after[1])
 
 
-def _product_along(middle: Pair, edge: Pair) -> Real:
-    """Mean of the product of both coordinates' signs along a line of some middle and extent."""
+def _over_edges(vector: Pair, long: Pair, short: Pair) -> Pair:
+    """A vector as so much of both edges of a parallelogram; of a point, which has none, nothing."""
+    area = _cross(long, short)
+    of_area = inverse(jnp.where(area == 0, 1.0, area))
+    return _cross(vector, short) * of_area, _cross(long, vector) * of_area
+
+
+def _mean_of(sides: _Sides, place: Pair) -> Real:
+    along, aside = sides
+    border = along[0].mean + along[1].mean + aside[0].mean + aside[1].mean
+    tilt = place[0] * (aside[1].mean - aside[0].mean) + place[1] * (along[1].mean - along[0].mean)
+    return 0.25 * border + 0.5 * tilt
+
+
+def _along(middle: Pair, edge: Pair) -> _Side:
+    """The product of both coordinates' signs along a line of some middle and extent."""
     signs, places = [], []
     for x, extent in zip(middle, edge, strict=True):
         crosses = jnp.abs(x) < 0.5 * jnp.abs(extent)
@@ -135,7 +253,8 @@ def _product_along(middle: Pair, edge: Pair) -> Real:
         # What does not change its sign might as well do so at the very end.
         # Divided by whether it does or not: both sides of a parallelogram share the quotient.
         places.append(jnp.where(crosses, -x * inverse(jnp.where(extent == 0, 1.0, extent)), 0.5))
-    return signs[0] * signs[1] * (1.0 - 2.0 * jnp.abs(places[0] - places[1]))
+    sign, apart = signs[0] * signs[1], jnp.abs(places[0] - places[1])
+    return _Side(sign * (1.0 - 2.0 * apart), -sign * apart * (places[0] + places[1]))
 
 
 def _dot(a: Pair, b: Pair) -> Real:
@@ -182,6 +301,11 @@ def _boxes(across: Real, down: Real) -> _Boxes:
     sharp = wide <= 0
     of_wide, of_narrow = (inverse(jnp.where(sharp, 1.0, width)) for width in (wide, narrow))
     return _Boxes(wide, narrow, of_wide, of_narrow)
+
+
+def _mean_wave(x: Real, boxes: _Boxes) -> Real:
+    """The filtered wave."""
+    return jnp.where(boxes.wide + boxes.narrow <= 1.0, _near_edge(x, boxes), _many_edges(x, boxes))
 
 
 def _near_edge(x: Real, boxes: _Boxes) -> Real:
