@@ -19,7 +19,7 @@ demo: $(READY)  ## draw a glass ball, then recover its glass from a picture
 	@echo "The fit, as numbers:   out/demo/fit/fit.json"
 	@echo "The fit, as a report:  out/demo/fit/report.png"
 
-# Most of a test's time is compilation, which fills a core and a third. A process takes up to 3 GB.
+# Most of a test's time is compilation, which fills little more than one core.
 test: $(READY)  ## every test, in as many processes as there are cores, eight at most
 	@$(PY) -m pytest --numprocesses=auto --maxprocesses=8 --dist=worksteal --durations=15
 
