@@ -107,7 +107,7 @@ def _slope_near(x: Real, move: Real, boxes: "_Boxes", widens: Real, grows: Real)
     further = away - 0.5 * (widens - grows)
     slope = 2.0 * away - part * (2.0 * further - part * grows)
     slope = (slope - (2.0 * distance - part * part * narrow) * (of_wide * widens)) * of_wide
-    rising = 1.0 - 2.0 * jnp.abs(edge - 2.0 * jnp.round(0.5 * edge))
+    rising = _parity(edge)
     slope = jnp.where(over < narrow, rising * slope, 0.0)
     return jnp.where(offset < 0, -slope, slope)
 
@@ -152,7 +152,7 @@ def _around_corner(middle: Pair, across: Pair, down: Pair) -> Real:
     """The mean of the product of both signs about the nearest corner of four tiles."""
     corner = [jnp.round(x) for x in middle]
     cells = corner[0] + corner[1]
-    even = 1.0 - 2.0 * jnp.abs(cells - 2.0 * jnp.round(0.5 * cells))
+    even = _parity(cells)
     at = (middle[0] - corner[0], middle[1] - corner[1])
     swap = _dot(down, down) > _dot(across, across)
     long, short = choose(swap, (down, across), (across, down))
@@ -257,6 +257,11 @@ def _along(middle: Pair, edge: Pair) -> _Side:
     return _Side(sign * (1.0 - 2.0 * apart), -sign * apart * (places[0] + places[1]))
 
 
+def _parity(whole: Real) -> Real:
+    """+1 of an even number, -1 of an odd one."""
+    return 1.0 - 2.0 * jnp.abs(whole - 2.0 * jnp.round(0.5 * whole))
+
+
 def _dot(a: Pair, b: Pair) -> Real:
     return a[0] * b[0] + a[1] * b[1]
 
@@ -311,7 +316,7 @@ def _mean_wave(x: Real, boxes: _Boxes) -> Real:
 def _near_edge(x: Real, boxes: _Boxes) -> Real:
     """The filtered wave where the footprint meets one edge at most; exact in float32 too."""
     edge = jnp.round(x)
-    rising = 1.0 - 2.0 * jnp.abs(edge - 2.0 * jnp.round(0.5 * edge))
+    rising = _parity(edge)
     return rising * _filtered_sign(x - edge, boxes)
 
 
@@ -340,7 +345,7 @@ def _mean_ramp(x: Real, boxes: _Boxes) -> Real:
     width = boxes.narrow
     half = 0.5 * width
     kink = jnp.round(x)
-    rising = 1.0 - 2.0 * jnp.abs(kink - 2.0 * jnp.round(0.5 * kink))
+    rising = _parity(kink)
     distance = jnp.abs(x - kink)
     rounded = (distance * distance + half * half) * boxes.of_narrow
     one_kink = rising * jnp.where(distance < half, rounded, distance) + 0.5 * (1.0 - rising)
