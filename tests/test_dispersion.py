@@ -130,3 +130,13 @@ def test_a_glass_with_an_index_has_no_error(glass):
 
 def test_negative_C_has_no_pole():
     assert domain_error(Sellmeier([1.0, 0, 0], [-0.25, 0, 0]), 0.38, 0.78) is None
+
+
+def test_a_term_without_strength_has_no_pole():
+    glass = Sellmeier([0.0, 0.5, 0.0], [0.25, 0.0, 0.0])
+    on_its_pole = np.array([0.5])
+    np.testing.assert_allclose(glass.indices(on_its_pole), np.sqrt(1.5))
+    slopes = jax.grad(lambda glass: glass.refractive_index(jnp.asarray(0.5)))(
+        jax.tree.map(jnp.asarray, glass)
+    )
+    assert all(np.isfinite(leaf).all() for leaf in (slopes.B, slopes.C))

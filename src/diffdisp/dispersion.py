@@ -53,10 +53,15 @@ class Sellmeier(eqx.Module):
 
     def _squared_index(self, wavelength: Any) -> Any:
         squared = wavelength * wavelength
-        # Term by term: the tracer calls this for one glass at a time, and C = 0 with B = 0 is a
-        # vacuum bubble, whose term must vanish at every wavelength.
-        terms = [self.B[i] * squared / (squared - self.C[i]) for i in range(3)]
-        return 1.0 + (terms[0] + (terms[1] + terms[2]))
+        # Term by term: the tracer calls this for one glass at a time.
+        first, *others = (self._term(i, squared) for i in range(3))
+        return 1.0 + (first + (others[0] + others[1]))
+
+    def _term(self, number: int, squared: Any) -> Any:
+        """One of the terms; one of no strength has no pole."""
+        B, gap = self.B[number], squared - self.C[number]
+        both = module_of(B, gap)
+        return B * squared / both.where((B == 0) & (gap == 0), 1.0, gap)
 
     def indices(
         self, wavelengths: Float[jax.Array | np.ndarray, " k"]
