@@ -1,3 +1,5 @@
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -286,3 +288,14 @@ def test_the_numbers_of_a_texture_are_its_leaves():
     assert len(jax.tree.leaves(Checker2D([1, 1, 1], [0, 0, 0], 0.5))) == 3
     assert len(jax.tree.leaves(Checker([1, 1, 1], [0, 0, 0]))) == 3
     assert jnp.result_type(Solid([1, 0, 0]).color) == np.float64
+
+
+@pytest.mark.parametrize("size", [1e-2, 1e-11, 1e-15])
+def test_slopes_on_tiles_much_larger_than_a_footprint_are_finite(size):
+    """In float32, whose largest number is 3e38: the fourth power of the last would be beyond."""
+    single = partial(jnp.asarray, dtype=jnp.float32)
+    across, down = ((single(0.7 * size), single(0.3 * size)), (single(0.2 * size), single(size)))
+    middle = (single(0.2), single(0.4))
+    mean, slopes = jax.jit(jax.value_and_grad(filtered_tiles, (0, 1, 2)))(middle, across, down)
+    assert mean == 1.0
+    assert all(np.isfinite(slope) for slope in jax.tree.leaves(slopes))

@@ -156,9 +156,13 @@ def _around_corner(middle: Pair, across: Pair, down: Pair) -> Real:
     at = (middle[0] - corner[0], middle[1] - corner[1])
     swap = _dot(down, down) > _dot(across, across)
     long, short = choose(swap, (down, across), (across, down))
-    square, area = _dot(long, long), _cross(long, short)
-    size = jnp.where(square <= 0, 1.0, square)
-    wider = jnp.maximum(SLIVER - jnp.abs(area) * inverse(size), 0.0)
+    # In units of the long edge: on large tiles the fourth power of a footprint, which is in the
+    # slope of what is divided, is not a number of float32.
+    reach = jax.lax.stop_gradient(jnp.abs(long[0]) + jnp.abs(long[1]))
+    unit = inverse(jnp.where(reach <= 0, 1.0, reach))
+    along, aside = ((edge[0] * unit, edge[1] * unit) for edge in (long, short))
+    square, area = _dot(along, along), _cross(along, aside)
+    wider = jnp.maximum(SLIVER - jnp.abs(area) * inverse(jnp.where(square <= 0, 1.0, square)), 0.0)
     wider = jnp.where(area < 0, -wider, wider)
     short = (short[0] - wider * long[1], short[1] + wider * long[0])
     return even * _product_over(at, long, short)
