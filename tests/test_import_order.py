@@ -29,11 +29,13 @@ ORDER = (
     "chunks",
     "wavefront",
     "rendering",
+    "tolerance",
     "misfit",
     "linearised",
     "fitting",
     "varying",
     "scene_file",
+    "measuring",
     "report",
     "__main__",
 )

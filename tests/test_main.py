@@ -1,4 +1,5 @@
 import contextlib
+import itertools
 import json
 import os
 import pty
@@ -22,8 +23,10 @@ from diffdisp import fitting
 from diffdisp.__main__ import main
 from diffdisp.film import Film
 from diffdisp.image import Picture, read_picture, write_picture
+from diffdisp.measuring import Setting
 from diffdisp.rendering import Growing, render_progressively
 from diffdisp.scene_file import load_scene
+from diffdisp.tolerance import Estimated, render_to_tolerance
 
 ROOT = Path(__file__).parents[1]
 FIXTURES = ROOT / "fixtures"
@@ -49,6 +52,14 @@ material = { type = "emitter", texture = { type = "checker2d", even = [1, 1, 1],
 odd = [0.1, 0.1, 0.1], tile = 0.5 }, intensity = 1 }
 """
 SCENE = CAMERA + BALL + SCREEN
+MATTE_AND_LAMP = """\
+[[object]]
+shape = { type = "sphere", center = [0, 0, 0], radius = 1 }
+material = { type = "lambertian", texture = [0.8, 0.8, 0.8] }
+[[object]]
+shape = { type = "sphere", center = [2, 3, 2], radius = 0.5 }
+material = { type = "emitter", texture = [1, 1, 1] }
+"""
 
 
 def own_glass(B, C):
@@ -74,6 +85,14 @@ def target(tmp_path):
     path = tmp_path / "target.npz"
     radiance = np.random.default_rng(1).uniform(0, 1, (6, 8, 2))
     write_picture(path, Picture(radiance, np.array([0.5, 0.6])))
+    return str(path)
+
+
+@pytest.fixture
+def lit(tmp_path):
+    """A scene that scatters light: a matte ball and a lamp."""
+    path = tmp_path / "lit.toml"
+    path.write_text(CAMERA + MATTE_AND_LAMP, encoding="utf-8")
     return str(path)
 
 
@@ -187,6 +206,10 @@ def test_bad_glass(tmp_path, out, capsys, B, C, bands, phrase):
 BAD_OPTIONS = {
     "no output": ("", "-o OUT"),
     "timing without output": ("--plan --timing", "-o OUT"),
+    "tolerance 0": ("-o {out}/a.png --tolerance 0", "must be above 0; found '0'"),
+    "tolerance and samples": ("-o {out}/a.png --tolerance 1 --samples 4", "not allowed with"),
+    "tolerance and quality": ("-o {out}/a.png --tolerance 1 --quality draft", "not allowed with"),
+    "samples and quality": ("-o {out}/a.png --samples 4 --quality draft", "not allowed with"),
     "unknown suffix": ("-o {out}/a.jpg", "found '.jpg'"),
     "no suffix": ("-o {out}/a", ".npz, .png"),
     "missing folder": ("-o {out}/no/a.png", "there is no folder"),
@@ -221,7 +244,6 @@ BAD_OPTIONS = {
     "unknown quality": ("-o {out}/a.png --quality best", "--quality"),
     "unknown option": ("-o {out}/a.png --fast", "--fast"),
     "an abbreviation": ("-o {out}/a.png --sam 4", "--sam"),
-    "tolerance, not yet": ("-o {out}/a.png --tolerance 0.1", "--tolerance"),
     "a second scene": ("other.toml -o {out}/a.png", "other.toml"),
 }
 
@@ -253,7 +275,7 @@ def test_bad_option(scene, out, capsys, options, phrase):
         (f"glass {FIXTURES}/glasses/sample.agf:NOSUCH", "has no glass 'NOSUCH'"),
         (f"glass {FIXTURES}/README.yml", "README.yml"),
         ("explore", "explore"),
-        ("tradeoff scene.toml -o a", "tradeoff"),
+        ("tradeoff nosuch.toml -o a", "nosuch.toml: cannot be read"),
     ],
 )
 def test_bad_command(out, monkeypatch, capsys, arguments, phrase):
@@ -547,6 +569,20 @@ def test_ctrl_c_at_a_terminal(out):
     assert [file.name for file in out.iterdir()] == ["a.npz"]
 
 
+def test_ctrl_c_keeps_what_there_is_on_the_way_to_a_tolerance(lit, out, capsys, monkeypatch):
+    def draw(*args, progress, **options):
+        yield from itertools.islice(render_to_tolerance(*args, progress=progress, **options), 2)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("diffdisp.tolerance.render_to_tolerance", draw)
+    path = out / "a.npz"
+    assert main(["render", lit, "-o", str(path), *SMALL[:2], "--tolerance", "0.01"]) == 130
+    told = capsys.readouterr()
+    picture = read_picture(path)
+    holds = f"{path} holds {picture.samples} samples a pixel in float32, estimated error 0"
+    assert (told.out, told.err[: len(holds) + 23]) == ("", f"diffdisp: interrupted: {holds}")
+
+
 # Good renders.
 
 
@@ -576,6 +612,33 @@ def test_gallery(out, capsys, name):
     # Something is lit and something is not; saturated colours and noise may be below 0.
     assert 0.01 < radiance.mean() < 10
     assert radiance.std() > 0.1 * radiance.mean()
+
+
+def test_a_tolerance_chooses_the_samples(lit, out, capsys):
+    words = ["render", lit, "-o", str(out / "a.npz"), *SMALL[:2], "--tolerance", "0.1"]
+    assert main(words) == 0
+    told = re.fullmatch(
+        r"(\d+) samples a pixel in float32, estimated error (0\.\d+)\n", capsys.readouterr().out
+    )
+    picture = read_picture(out / "a.npz")
+    assert picture.samples == int(told[1])
+    assert picture.seed is None  # a mean over pictures of several
+    assert float(told[2]) <= 0.1
+    assert main([*words, "--timing"]) == 0
+    timing = json.loads(capsys.readouterr().out)
+    assert timing.keys() == TIMING | {"samples", "estimated_error"}
+    assert timing["samples"] == picture.samples
+    assert timing["paths"] == 8 * 6 * picture.samples
+    assert timing["estimated_error"] == pytest.approx(float(told[2]), rel=0.05)
+
+
+def test_a_tolerance_that_is_not_reached(lit, out, capsys, monkeypatch):
+    picture = Estimated(np.ones((6, 8, 3)), 4, 0.5, None, "float64")
+    monkeypatch.setattr("diffdisp.tolerance.render_to_tolerance", lambda *_, **__: iter([picture]))
+    assert main(["render", lit, "-o", str(out / "a.npz"), "--tolerance", "0.1"]) == 3
+    holds = f"{out / 'a.npz'} holds 4 samples a pixel in float64, estimated error 0.5"
+    assert capsys.readouterr() == ("", f"diffdisp: not reached: {holds}\n")
+    assert read_picture(out / "a.npz").samples == 4
 
 
 def test_float64_and_seed(scene, out):
@@ -635,11 +698,15 @@ def test_plan_with_output_also_renders(scene, out, capsys):
     assert [file.name for file in out.iterdir()] == ["a.png"]
 
 
+TIMING = {"compile_s", "render_s", "cpu_s", "paths", "paths_per_s", "peak_memory_mb"}
+
+
 def test_timing_is_one_line_of_json(scene, out, capsys):
     assert main(["render", scene, "--timing", "-o", str(out / "a.png"), *SMALL]) == 0
     (line,) = capsys.readouterr().out.splitlines()
     timing = json.loads(line)
-    assert timing.keys() == {"compile_s", "render_s", "paths", "paths_per_s", "peak_memory_mb"}
+    assert timing.keys() == TIMING
+    assert timing["cpu_s"] > 0
     assert timing["paths"] == 8 * 6 * 2
     assert timing["paths_per_s"] == pytest.approx(timing["paths"] / timing["render_s"])
     assert timing["compile_s"] >= 0
@@ -947,3 +1014,52 @@ def test_as_a_process():
     assert done.stdout == ""
     assert "diffdisp: argument --size: must be a whole number of at least 1" in done.stderr
     assert not re.search(r"\| +(jax|numpy)\n", done.stderr)
+
+
+# What accuracy costs.
+
+
+def test_tradeoff(lit, out, capsys, monkeypatch):
+    settings = (Setting(1, 4), Setting(2, 4))
+    monkeypatch.setattr("diffdisp.measuring.knob_grid", lambda *_: settings)
+    folder = out / "new"
+    words = ["tradeoff", lit, "-o", str(folder), *SMALL]
+    assert main(words) == 0
+    told = capsys.readouterr().out
+    assert "\n*  1 sample, depth 4 " in told
+    assert "The reference has 8 samples a pixel" in told
+    assert {file.name for file in folder.iterdir()} == {
+        "tradeoff.csv",
+        "tradeoff.png",
+        "reference.npz",
+    }
+    rows = (folder / "tradeoff.csv").read_text(encoding="utf-8").splitlines()
+    assert rows[0].startswith("samples,depth,dtype,bands,shrink,error,delta_e_mean,delta_e_p99,")
+    assert len(rows) == 3
+
+
+def test_ctrl_c_in_a_tradeoff_says_how_far_it_came(lit, out, capsys, monkeypatch):
+    def interrupted(*_args, progress, **_options):
+        progress(3, 7)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("diffdisp.measuring.tradeoff", interrupted)
+    assert main(["tradeoff", lit, "-o", str(out / "new")]) == 130
+    told = f"diffdisp: interrupted: {out / 'new'} holds 3 of 7 settings; the same command goes on\n"
+    assert capsys.readouterr() == ("", told)
+
+
+@pytest.mark.parametrize(
+    ("options", "phrase"),
+    [
+        ("", "required: -o"),
+        ("-o {out}/new --samples 0", "at least 1"),
+        ("-o {out}/new --bands 90:200:2", "a pole"),
+        ("-o {out}/new --size 1000000x1000000", "not enough memory"),
+        ("-o {out}/file/new", "is no folder"),
+    ],
+)
+def test_a_tradeoff_that_cannot_be(scene, out, capsys, options, phrase):
+    (out / "file").write_text("a file")
+    refused(capsys, ["tradeoff", scene, *options.format(out=out).split()], phrase)
+    assert [file.name for file in out.iterdir()] == ["file"]

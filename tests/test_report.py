@@ -11,16 +11,20 @@ from diffdisp.film import Film
 from diffdisp.fitting import FreeValue, Resampled
 from diffdisp.glasses import named_glass
 from diffdisp.image import Picture
+from diffdisp.measuring import Measured, Setting, Tradeoff
 from diffdisp.report import (
     bench_json,
     bench_table,
     fit_json,
     result_table,
+    tradeoff_summary,
+    tradeoff_table,
     write_bench_json,
     write_bench_plot,
     write_fit_json,
     write_glass_plot,
     write_report,
+    write_tradeoff_plot,
 )
 from diffdisp.varying import Bench, Variation
 
@@ -325,3 +329,64 @@ def test_variations_are_drawn(tmp_path, count):
     assert height > (400 if count < 3 else 800)
     with pytest.raises(ValueError, match=r"found '\.doc'"):
         write_bench_plot(tmp_path / "plan.doc", fake_bench(count))
+
+
+def fake_tradeoff():
+    """Measured settings: an error of samples^-0.5 and a time of samples^1, and other knobs."""
+    settings = [Setting(4**power, 50) for power in range(5)]
+    rows = [
+        Measured(0.2 * 0.5**power, 1.0, 2.5, 3.0, 0.1 * 4.0**power, 0.2, 512.3)
+        for power in range(5)
+    ]
+    settings += [Setting(16, 2), Setting(16, 50, "float64"), Setting(16, 50, bands=8)]
+    settings += [Setting(16, 50, shrink=2)]
+    rows += [Measured(error, 1.0, 2.5, 3.0, 2.0, 0.2, 512.3) for error in (0.06, 0.05, 0.004, 0.3)]
+    return Tradeoff(tuple(settings), tuple(rows), 0.005, 1024, Film(8, 6))
+
+
+def test_a_tradeoff_as_a_table():
+    lines = tradeoff_table(fake_tradeoff()).split("\n")
+    assert lines[0].split() == [
+        "setting",
+        "error",
+        "ΔE",
+        "99",
+        "%",
+        "compile",
+        "s",
+        "s",
+        "CPU",
+        "s",
+        "MB",
+    ]
+    assert (
+        lines[1]
+        == "*  1 sample, depth 50                 0.2  1.00  2.50          3   0.1    0.2  512"
+    )
+    # Two that are worse than another one, and one beyond what the reference tells.
+    assert lines[6].startswith("   16 samples, depth 2 ")
+    assert lines[7].startswith("   16 samples, depth 50, float64 ")
+    assert lines[8].startswith("*  16 samples, depth 50, 8 bands  <0.005 ")
+    assert lines[9].startswith("   16 samples, depth 50, 1/2 size ")
+    assert lines[11:] == [
+        "For 10% take 4 samples, depth 50: 0.4 s.",
+        "For 3% take 16 samples, depth 50, 8 bands: 2 s.",
+        "For 1% take 16 samples, depth 50, 8 bands: 2 s.",
+        "The error falls as samples^-0.50; halving it costs 4.0 times the time.",
+        "The reference has 1024 samples a pixel and an error of 0.005 of its own.",
+    ]
+
+
+def test_of_one_setting_no_fall_is_said():
+    found = fake_tradeoff()
+    one = found._replace(settings=found.settings[:1], measured=found.measured[:1])
+    assert "falls" not in tradeoff_summary(one)
+
+
+def test_a_tradeoff_is_drawn(tmp_path):
+    write_tradeoff_plot(tmp_path / "tradeoff.png", fake_tradeoff())
+    width, height = size_of(tmp_path / "tradeoff.png")
+    assert width > 900
+    assert height > 600
+    with pytest.raises(ValueError, match=r"found '\.doc'"):
+        write_tradeoff_plot(tmp_path / "tradeoff.doc", fake_tradeoff())

@@ -23,6 +23,8 @@ PRIORS, LOSSES = ("none", "catalogue", "fixed-c3"), ("squares", "robust")
 
 PLAN_SIZE = (96, 96)
 """Pixels of a picture that is only thought of: a few seconds a bench."""
+TRADEOFF_SIZE = (160, 120)
+"""Pixels of a picture that is drawn with many settings."""
 PLAN_COLUMNS = 8
 """Pictures that its slopes are: six, of a colour picture, and those along what else is free."""
 
@@ -142,6 +144,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_render(commands.add_parser("render", help="draw a scene"))
     _add_fit(commands.add_parser("fit", help="recover the glass of a ball from a picture"))
     _add_plan_fit(commands.add_parser("plan-fit", help="what a picture of a scene would tell"))
+    _add_tradeoff(commands.add_parser("tradeoff", help="measure what accuracy costs"))
     _add_glass(commands.add_parser("glass", help="print what is known of a glass"))
     return parser
 
@@ -154,8 +157,11 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
     add("scene", metavar="SCENE", help="a scene file, .toml")
     add("-o", dest="output", metavar="OUT", help=".png (sRGB), .tiff or .exr (float32), .npz")
     add("--size", type=_size, default=(480, 480), metavar="WxH", help="pixels (default 480x480)")
-    add("--quality", choices=QUALITY, default="standard", help=f"samples per pixel: {presets}")
-    add("--samples", type=_count, metavar="N", help="samples per pixel (default: by --quality)")
+    accuracy = parser.add_mutually_exclusive_group()
+    often = accuracy.add_argument
+    often("--quality", choices=QUALITY, help=f"samples per pixel: {presets} (default standard)")
+    often("--samples", type=_count, metavar="N", help="samples per pixel")
+    often("--tolerance", type=_positive, metavar="T", help=_TOLERANCE_HELP)
     add("--depth", type=_depth, default=50, metavar="N", help="segments of a path (default 50)")
     add("--bands", type=_bands, metavar="LOW:HIGH:COUNT", help=_BANDS_HELP)
     add("--float64", action="store_true", help="compute in double precision (default: single)")
@@ -164,6 +170,10 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
     add("--timing", action="store_true", help="also print how long it takes, as a line of JSON")
 
 
+_TOLERANCE_HELP = (
+    "as many samples as make the estimated error, root mean square over that of the picture, "
+    "at most this"
+)
 _BANDS_HELP = "nm; equal bands, seen at their middles, as 400:700:16 (default: colour)"
 
 
@@ -183,7 +193,7 @@ def _add_fit(parser: argparse.ArgumentParser) -> None:
     add("--prior", choices=PRIORS, default="none", help="what is known beforehand (default none)")
     add("--loss", choices=LOSSES, default="squares", help="robust: outliers do not count")
     add("--check", action="store_true", help="of n_d's error, by resampling the residual")
-    add("--noise", type=_noise, metavar="SIGMA", help="of the radiance (default: estimated)")
+    add("--noise", type=_positive, metavar="SIGMA", help="of the radiance (default: estimated)")
     add("--start", metavar="GLASS", help="glass to start from (default: that of the scene)")
     add(
         "--mask", metavar="FILE", help="a picture of TARGET's size; where it is 0 nothing is fitted"
@@ -206,7 +216,7 @@ def _add_plan_fit(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(run=_plan_fit)
     add = parser.add_argument
     add("scene", metavar="SCENE", help="a scene file, .toml, with the glass to expect")
-    add("--noise", type=_noise, required=True, metavar="SIGMA", help="of the radiance")
+    add("--noise", type=_positive, required=True, metavar="SIGMA", help="of the radiance")
     add("-o", dest="output", metavar="DIR", help="for plan.json and plan.png")
     add("--size", type=_size, default=PLAN_SIZE, metavar="WxH", help="pixels (default 96x96)")
     add("--bands", type=_bands, metavar="LOW:HIGH:COUNT", help=_BANDS_HELP)
@@ -216,6 +226,24 @@ def _add_plan_fit(parser: argparse.ArgumentParser) -> None:
 
 
 _PLAN_FREE_HELP = "would be fitted too, as in fit; may be given several times"
+
+
+def _add_tradeoff(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Draw a scene with many settings, and measure the error and the time of each. Ctrl-C "
+        "keeps what has been measured; the same command goes on from there."
+    )
+    parser.set_defaults(run=_tradeoff)
+    add = parser.add_argument
+    add("scene", metavar="SCENE", help="a scene file, .toml")
+    add("-o", dest="output", metavar="DIR", required=True, help="for tradeoff.csv and .png")
+    size = "pixels (default {}x{})".format(*TRADEOFF_SIZE)
+    add("--size", type=_size, default=TRADEOFF_SIZE, metavar="WxH", help=size)
+    add("--bands", type=_bands, metavar="LOW:HIGH:COUNT", help=_BANDS_HELP)
+    most = f"most samples per pixel (default {QUALITY['reference']})"
+    add("--samples", type=_count, default=QUALITY["reference"], metavar="N", help=most)
+    add("--depth", type=_depth, default=50, metavar="N", help="most segments (default 50)")
+    add("--seed", type=_seed, default=0, metavar="N", help="of random choices (default 0)")
 
 
 def _add_glass(parser: argparse.ArgumentParser) -> None:
@@ -271,12 +299,12 @@ def _real(text: str) -> float:
     return number
 
 
-def _noise(text: str) -> float:
-    """A standard deviation."""
-    sigma = _real(text)
-    if not sigma > 0:
+def _positive(text: str) -> float:
+    """A standard deviation, say."""
+    number = _real(text)
+    if not number > 0:
         raise argparse.ArgumentTypeError(f"must be above 0; found {text!r}")
-    return sigma
+    return number
 
 
 def _bands(text: str) -> tuple[float, float, int]:
@@ -299,38 +327,104 @@ def _render(options: argparse.Namespace) -> int:
     """`diffdisp render`."""
     if not options.output and (options.timing or not options.plan):
         raise ValueError("render needs -o OUT; only --plan goes without a picture")
-    from diffdisp.image import Picture, check_output, write_picture
+    from diffdisp.image import check_output
     from diffdisp.planning import make_plan
-    from diffdisp.rendering import compile_ahead, render, render_progressively
     from diffdisp.scene_file import load_scene
 
     scene = load_scene(options.scene)
-    samples = options.samples or QUALITY[options.quality]
-    depth, dtype = options.depth, "float64" if options.float64 else "float32"
+    samples = options.samples or QUALITY[options.quality or "standard"]
+    dtype = "float64" if options.float64 else "float32"
     film = _film(options.size, options.bands, samples, dtype)
     if options.output:
         check_output(options.output, film.wavelengths)
     _check_glasses(scene, options.bands)
     if options.plan:
-        print(make_plan(scene, film, samples, depth, dtype))
+        print(make_plan(scene, film, samples, options.depth, dtype))
     if not options.output:
         return DONE
     _keep_compiled()
-    knobs = {"samples": samples, "depth": depth, "dtype": dtype}
+    knobs = {"depth": options.depth, "seed": options.seed, "dtype": dtype}
+    if options.tolerance:
+        return _draw_to_tolerance(options, scene, film, knobs)
+    return _draw_samples(options, scene, film, samples, knobs)
 
-    def write(radiance: Any, drawn: int) -> None:
-        picture = Picture(radiance, film.wavelengths, drawn, depth, options.seed)
-        write_picture(options.output, picture)
 
+def _draw_samples(
+    options: argparse.Namespace, scene: Any, film: Any, samples: int, knobs: dict[str, Any]
+) -> int:
+    """A picture of so many samples."""
+    from diffdisp.rendering import Growing, compile_ahead, render, render_progressively
+
+    def write(picture: Growing) -> None:
+        _write_picture(options, film, *picture, options.seed)
+
+    knobs["samples"] = samples
+    if options.timing:
+        compiling = {name: value for name, value in knobs.items() if name != "seed"}
+        build = partial(compile_ahead, scene, film, **compiling)
+        radiance, timing = _timed(build, partial(render, scene, film, **knobs))
+        write(Growing(radiance, samples))
+        _print_timing(timing, film, samples)
+        return DONE
+    draw = partial(render_progressively, scene, film, **knobs)
+    picture = _grow(draw, write, lambda p: f"{p.samples} of {samples} samples", options.output)
+    return INTERRUPTED if picture is None else DONE
+
+
+def _draw_to_tolerance(
+    options: argparse.Namespace, scene: Any, film: Any, knobs: dict[str, Any]
+) -> int:
+    """A picture of an estimated error within the tolerance."""
+    from diffdisp.tolerance import Estimated, render_to_tolerance
+
+    draw = partial(render_to_tolerance, scene, film, options.tolerance, **knobs)
+
+    def last() -> Estimated:
+        *_, picture = draw()
+        return picture
+
+    def write(picture: Estimated) -> None:
+        _write_picture(options, film, picture.radiance, picture.samples, picture.seed)
+
+    if options.timing:
+        picture, timing = _timed(last, last)
+        # The samples are not known beforehand: the first picture compiles, and is drawn.
+        timing["compile_s"] = max(timing["compile_s"] - timing["render_s"], 0.0)
+        write(picture)
+        timing |= {"samples": picture.samples, "estimated_error": picture.error}
+        _print_timing(timing, film, picture.samples)
+    else:
+        picture = _grow(draw, write, _estimate, options.output)
+        if picture is None:
+            return INTERRUPTED
+    if picture.error > options.tolerance:
+        return _complain(f"not reached: {options.output} holds {_estimate(picture)}", NOT_CONVERGED)
     if not options.timing:
-        draw = partial(render_progressively, scene, film, seed=options.seed, **knobs)
-        return _grow(draw, write, samples, options.output)
-    build = partial(compile_ahead, scene, film, **knobs)
-    draw_whole = partial(render, scene, film, seed=options.seed, **knobs)
-    radiance, timing = _timed(build, draw_whole, film.width * film.height * samples)
-    write(radiance, samples)
-    print(json.dumps(timing))
+        print(_estimate(picture))
     return DONE
+
+
+def _estimate(picture: Any) -> str:
+    """What was chosen for a picture, and how good it is."""
+    error = "not known" if math.isinf(picture.error) else f"{picture.error:.2g}"
+    return f"{picture.samples} samples a pixel in {picture.dtype}, estimated error {error}"
+
+
+def _write_picture(
+    options: argparse.Namespace, film: Any, radiance: Any, samples: int, seed: int | None
+) -> None:
+    """Write radiance of so many samples."""
+    from diffdisp.image import Picture, write_picture
+
+    picture = Picture(radiance, film.wavelengths, samples, options.depth, seed)
+    write_picture(options.output, picture)
+
+
+def _print_timing(timing: dict[str, float], film: Any, samples: int) -> None:
+    """The times, and how many paths there were of them, as a line of JSON."""
+    paths = film.width * film.height * samples
+    rate = {"paths": paths, "paths_per_s": paths / timing["render_s"]}
+    print(json.dumps(timing | rate))
 
 
 def _film(
@@ -355,33 +449,40 @@ def _check_glasses(scene: Any, bands: tuple[float, float, int] | None) -> None:
 
 def _grow(
     draw: Callable[..., Iterator[Any]],
-    write: Callable[[Any, int], None],
-    samples: int,
+    write: Callable[[Any], None],
+    tell: Callable[[Any], str],
     output: str,
-) -> int:
-    """Draw and write a picture, with a progress bar; on Ctrl-C what there is of it by then."""
+) -> Any:
+    """Draw and write a picture, with a progress bar; on Ctrl-C what there is of it by then.
+
+    Args:
+        draw: given what is told the progress, the pictures on the way.
+        write: one of them.
+        tell: how far one of them is.
+        output: what is written.
+
+    Returns:
+        The last picture, or None if there was Ctrl-C.
+    """
     picture = None
     try:
         with _progress_bar("rendering", "part") as bar:
-            bar.set_postfix_str(f"0 of {samples} samples", refresh=False)
             for picture in draw(progress=lambda done, total: _advance(bar, done, total)):
-                bar.set_postfix_str(f"{picture.samples} of {samples} samples")
+                bar.set_postfix_str(tell(picture))
         assert picture is not None
-        write(*picture)
+        write(picture)
     except KeyboardInterrupt:
         if picture is None:
             raise
         # Once more where the first was cut short. A second Ctrl-C leaves the old file whole.
-        write(*picture)
-        holds = f"{output} holds {picture.samples} of {samples} samples"
-        return _complain(f"interrupted: {holds}", INTERRUPTED)
-    return DONE
+        write(picture)
+        _complain(f"interrupted: {output} holds {tell(picture)}")
+        return None
+    return picture
 
 
-def _timed(
-    build: Callable[[], None], draw: Callable[[], Any], paths: int
-) -> tuple[Any, dict[str, float]]:
-    """The picture, and how long it takes to compile and to draw."""
+def _timed(build: Callable[[], object], draw: Callable[[], Any]) -> tuple[Any, dict[str, float]]:
+    """The picture, and how long it takes to compile and to draw, by the clock and on all cores."""
     import resource
     import statistics
 
@@ -389,19 +490,18 @@ def _timed(
     build()
     compiled = time.perf_counter() - start
     draw()
-    seconds = []
+    seconds, busy = [], []
     for _ in range(WARM_RENDERS):
-        start = time.perf_counter()
+        start, start_busy = time.perf_counter(), time.process_time()
         picture = draw()
         seconds.append(time.perf_counter() - start)
-    warm = statistics.median(seconds)
+        busy.append(time.process_time() - start_busy)
     # Linux counts in KiB, macOS in bytes.
     unit = 1 if sys.platform == "darwin" else 1024
     return picture, {
         "compile_s": compiled,
-        "render_s": warm,
-        "paths": paths,
-        "paths_per_s": paths / warm,
+        "render_s": statistics.median(seconds),
+        "cpu_s": statistics.median(busy),
         "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6,
     }
 
@@ -482,6 +582,46 @@ def _plan_fit(options: argparse.Namespace) -> int:
         write_bench_plot(folder / "plan.png", bench)
         write_bench_json(folder / "plan.json", bench)
     print(bench_table(bench))
+    return DONE
+
+
+def _tradeoff(options: argparse.Namespace) -> int:
+    """`diffdisp tradeoff`."""
+    folder = Path(options.output)
+    _check_folder(folder, ("tradeoff.csv", "tradeoff.png", "reference.npz"))
+    from diffdisp.measuring import tradeoff
+    from diffdisp.report import tradeoff_table, write_tradeoff_plot
+    from diffdisp.scene_file import load_scene
+
+    scene = load_scene(options.scene)
+    _film(options.size, options.bands, options.samples, "float64")
+    _check_glasses(scene, options.bands)
+    _keep_compiled()
+    folder.mkdir(parents=True, exist_ok=True)
+    told = (0, 0)
+    try:
+        with _progress_bar("measuring", "setting") as bar:
+
+            def progress(done: int, total: int) -> None:
+                nonlocal told
+                told = done, total
+                _advance(bar, done, total)
+
+            found = tradeoff(
+                scene,
+                options.size,
+                options.bands,
+                folder,
+                most=options.samples,
+                depth=options.depth,
+                seed=options.seed,
+                progress=progress,
+            )
+    except KeyboardInterrupt:
+        holds = f"{folder} holds {told[0]} of {told[1]} settings"
+        return _complain(f"interrupted: {holds}; the same command goes on", INTERRUPTED)
+    write_tradeoff_plot(folder / "tradeoff.png", found)
+    print(tradeoff_table(found))
     return DONE
 
 

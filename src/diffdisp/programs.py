@@ -148,12 +148,12 @@ def _file(described: str) -> Path | None:
         return None
     if "://" in folder:  # JAX alone knows how to reach it
         return None
-    name = hashlib.sha256(f"{described} {_surroundings()}".encode()).hexdigest()
+    name = hashlib.sha256(f"{described} {surroundings()}".encode()).hexdigest()
     return Path(folder) / "diffdisp" / name
 
 
 @functools.cache
-def _surroundings() -> str:
+def surroundings() -> str:
     """All else that decides a program: source, versions, processor and device."""
     source = hashlib.sha256()
     for file in sorted(Path(__file__).parent.glob("*.py")):

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from diffdisp.camera import project
 from diffdisp.chunks import (
@@ -29,6 +29,7 @@ from diffdisp.chunks import (
     render_chunks,
     render_chunks_jit,
     run_numbers,
+    some_blocks,
     with_split_paths,
     workers,
 )
@@ -144,9 +145,13 @@ def passes(
     seed: int,
     dtype: str,
     progress: Progress | None = None,
+    most: int = MOST_SAMPLES,
 ) -> Iterator[Growing]:
-    """`render_progressively` of glasses that have been checked, or have no index somewhere."""
-    work = _lay_out(scene, film, samples, depth, dtype, seed)
+    """`render_progressively` of glasses that have been checked, or have no index somewhere.
+
+    And of passes of `most` samples at most.
+    """
+    work = _lay_out(scene, film, samples, depth, dtype, seed, most)
     total, count = np.zeros((), dtype), len(work.cells)
     for number in range(count):
 
@@ -190,10 +195,18 @@ class _Work(NamedTuple):
     tiles: list[Tiles] | None
 
 
-def _lay_out(scene: Scene, film: Film, samples: int, depth: int, dtype: str, seed: int) -> _Work:
-    """The work for a picture."""
+def _lay_out(
+    scene: Scene,
+    film: Film,
+    samples: int,
+    depth: int,
+    dtype: str,
+    seed: int,
+    most: int = MOST_SAMPLES,
+) -> _Work:
+    """The work for a picture, in passes of `most` samples at most."""
     whole = make_plan(scene, film, samples, depth, dtype)
-    most = min(MOST_SAMPLES, PASS_PATHS // (film.width * film.height))
+    most = min(most, PASS_PATHS // (film.width * film.height))
     share = max(count for count in range(1, max(most, 1) + 1) if samples % count == 0)
     plan = replace(whole, samples=share)
     # Each pass takes cells from all over the pixel: a step that is no divisor of their number
@@ -217,20 +230,65 @@ def _one_pass(
     work: _Work, film: Film, seed: int, number: int, progress: Progress
 ) -> Float[np.ndarray, "height width channels"]:
     """The mean of the samples of one pass over the picture."""
-    plan, cells = work.plan, np.roll(work.cells, -number, axis=0)
-    run = run_numbers(plan, seed, cells=cells)
-    spectrum = _of_pass(work, cells[0])
     if work.tiles is not None:
+        _, run, spectrum = _of_pass(work, seed, number)
         return _wavefront_pass(work, film, spectrum, run, progress)
-    chunks, place = all_pixels(film, chunk_pixels(film, plan))
+    every = np.arange(film.width * film.height)
+    values = _pixels_of_pass(work, film, seed, number, every, progress)
+    return values.reshape(film.height, film.width, film.channels)
+
+
+def some_pixels(
+    scene: Scene,
+    film: Film,
+    numbers: Int[np.ndarray, " pixels"],
+    samples: int,
+    depth: int,
+    seed: int,
+    dtype: str,
+) -> Float[np.ndarray, "pixels channels"]:
+    """What `render` shows at some pixels of a scene in which nothing but glass sends light on.
+
+    Args:
+        scene: as in `render`, without traced numbers, of glasses that have been checked.
+        film: as in `render`.
+        numbers: of the pixels, row by row of the picture.
+        samples: as in `render`.
+        depth: as in `render`.
+        seed: as in `render`.
+        dtype: as in `render`.
+    """
+    work = _lay_out(scene, film, samples, depth, dtype, seed)
+    shown = [_pixels_of_pass(work, film, seed, part, numbers) for part in range(len(work.cells))]
+    return np.mean(shown, axis=0)
+
+
+def _pixels_of_pass(
+    work: _Work,
+    film: Film,
+    seed: int,
+    number: int,
+    pixels: Int[np.ndarray, " pixels"],
+    progress: Progress | None = None,
+) -> Float[np.ndarray, "pixels channels"]:
+    """The mean of the samples of one pass by the direct loop, of some pixels."""
+    plan, run, spectrum = _of_pass(work, seed, number)
+    chunks, place = some_blocks(pixels, film.width, 1.0, chunk_pixels(film, plan))
     fixed = (plan, work.scene, spectrum, film_size(film))
     values = over_chunks(
         lambda part: np.asarray(render_chunks_jit(*fixed, part, run)), chunks, plan.dtype, progress
     )
-    return values.reshape(-1, film.channels)[place].reshape(film.height, film.width, film.channels)
+    return values.reshape(-1, film.channels)[place]
 
 
-def _of_pass(work: _Work, cells: np.ndarray) -> Spectrum:
+def _of_pass(work: _Work, seed: int, number: int) -> tuple[Plan, RunNumbers, Spectrum]:
+    """The plan, the numbers and the spectrum of one pass."""
+    cells = np.roll(work.cells, -number, axis=0)
+    run = run_numbers(work.plan, seed, cells=cells)
+    return work.plan, run, _spectrum_of(work, cells[0])
+
+
+def _spectrum_of(work: _Work, cells: np.ndarray) -> Spectrum:
     """The spectrum of the samples of one pass; what they count is over these alone."""
     spectrum, passes = work.spectrum, len(work.cells)
     if spectrum.weights is None:
@@ -348,9 +406,7 @@ def compile_ahead(scene: Scene, film: Film, *, samples: int, depth: int, dtype: 
         dtype: "float32" or "float64".
     """
     work = _lay_out(scene, film, samples, depth, dtype, seed=0)
-    plan = work.plan
-    spectrum = _of_pass(work, work.cells[0])
-    run = run_numbers(plan, 0, cells=work.cells)
+    plan, run, spectrum = _of_pass(work, 0, 0)
     if work.tiles is None:
         chunks, _ = all_pixels(film, chunk_pixels(film, plan))
         fixed = (plan, work.scene, spectrum, film_size(film))

@@ -21,6 +21,7 @@ from diffdisp.dispersion import Sellmeier
 from diffdisp.fitting import FitResult, Resampled, Uncertainty
 from diffdisp.glasses import named_glass
 from diffdisp.image import Picture, linear_rgb, replacing
+from diffdisp.measuring import Measured, Setting, Tradeoff
 from diffdisp.varying import Bench, Variation
 
 UNDETERMINED = 0.1
@@ -28,6 +29,9 @@ UNDETERMINED = 0.1
 
 LEAST_PROBABILITY = 5e-4
 """What the table shows of a probability is rounded to 0.001."""
+
+TRADED = (0.1, 0.03, 0.01)
+"""Errors for which the fastest setting is said."""
 
 PLOT_LIMITS = (0.1, 50.0)
 """Wavelengths that a plot of a glass shows at most, µm."""
@@ -560,6 +564,137 @@ def _draw_variation(axis: Axes, some: Variation, known: Uncertainty) -> None:
     axis.tick_params(labelleft=True)
     axis.grid(alpha=0.3)
     axis.legend(fontsize="small")
+
+
+# What accuracy costs.
+
+
+def tradeoff_table(found: Tradeoff) -> str:
+    """The measured settings, the ones that nothing beats marked, and what they say in a sentence.
+
+    Args:
+        found: of `tradeoff`.
+
+    Returns:
+        Lines without a newline after the last one.
+    """
+    head = ("", "setting", "error", "ΔE", "99 %", "compile s", "s", "CPU s", "MB")
+    rows = [list(head)]
+    for number, (setting, row) in enumerate(zip(found.settings, found.measured, strict=True)):
+        told = [_error_words(row, found), f"{row.delta_e_mean:.2f}", f"{row.delta_e_p99:.2f}"]
+        told += [f"{value:.3g}" for value in (row.compile_s, row.render_s, row.cpu_s)]
+        mark = "*" if number in found.front else ""
+        rows.append([mark, setting_words(setting), *told, f"{row.peak_memory_mb:.0f}"])
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = []
+    for mark, name, *told in rows:
+        right = (text.rjust(width) for text, width in zip(told, widths[2:], strict=True))
+        lines.append("  ".join([mark.ljust(widths[0]), name.ljust(widths[1]), *right]))
+    return "\n".join([*lines, "", tradeoff_summary(found)])
+
+
+def _error_words(row: Measured, found: Tradeoff) -> str:
+    """The error, or that it is smaller than what the reference can tell."""
+    if row.error > found.reference_error:
+        return f"{row.error:.2g}"
+    return f"<{found.reference_error:.1g}"
+
+
+def setting_words(setting: Setting) -> str:
+    """A setting, of which the samples are always said and the rest where it is not as usual."""
+    words = [_count(setting.samples, "sample"), f"depth {setting.depth}"]
+    words += [setting.dtype] if setting.dtype != "float32" else []
+    words += [_bands(setting.bands)] if setting.bands else []
+    words += [f"1/{setting.shrink} size"] if setting.shrink > 1 else []
+    return ", ".join(words)
+
+
+def tradeoff_summary(found: Tradeoff) -> str:
+    """What to take for an error of 10, 3 and 1 %, and what half of an error costs."""
+    said = []
+    for error in TRADED:
+        number = found.fastest(error)
+        if number is not None:
+            setting, row = found.settings[number], found.measured[number]
+            said.append(f"for {error:.0%} take {setting_words(setting)}: {row.render_s:.2g} s")
+    sentences = [*said]
+    if math.isfinite(found.fall) and math.isfinite(found.price):
+        sentences.append(
+            f"the error falls as samples^-{found.fall:.2f}; halving it costs"
+            f" {found.price:.1f} times the time"
+        )
+    reference = (
+        f"the reference has {found.reference_samples} samples a pixel and an error of"
+        f" {found.reference_error:.1g} of its own"
+    )
+    return "\n".join(f"{text[0].upper()}{text[1:]}." for text in [*sentences, reference])
+
+
+def write_tradeoff_plot(path: str | os.PathLike[str], found: Tradeoff) -> None:
+    """Draw error over time of each setting, and the line of those that nothing beats.
+
+    The file is written beside and renamed.
+
+    Args:
+        path: where to; the suffix says the format: .png, .pdf or .svg.
+        found: of `tradeoff`.
+
+    Raises:
+        ValueError: a suffix that cannot be drawn, or a folder that does not exist.
+    """
+    check_plot_output(path)
+    figure = Figure(figsize=(8.5, 5.8), layout="constrained")
+    axis = figure.subplots()
+    axis.set_xscale("log")
+    axis.set_yscale("log")
+    kinds: dict[str, list[int]] = {}
+    for number, setting in enumerate(found.settings):
+        kinds.setdefault(_turned(setting, found.settings[0]), []).append(number)
+    for (kind, numbers), marker in zip(kinds.items(), "osD^v<>P", strict=False):
+        rows = [found.measured[number] for number in numbers]
+        seconds, errors = [row.render_s for row in rows], [row.error for row in rows]
+        line = "-" if kind == "samples alone" else ""
+        axis.plot(seconds, errors, marker, linestyle=line, markersize=6, label=kind, alpha=0.8)
+        for number, x, y in zip(numbers, seconds, errors, strict=True):
+            text = _mark_words(found.settings[number], kind)
+            axis.annotate(text, (x, y), (4, 4), textcoords="offset points", fontsize=8)
+    front = [found.measured[number] for number in found.front]
+    axis.step(
+        [row.render_s for row in front],
+        [row.error for row in front],
+        where="post",
+        color="0.6",
+        zorder=0,
+        label="nothing is faster and nearer",
+    )
+    axis.axhline(found.reference_error, color="0.6", linestyle=":", label="error of the reference")
+    axis.set_xlabel("time of a render (s)")
+    axis.set_ylabel("relative root mean square error")
+    film = found.film
+    channels = "colour" if film.wavelengths is None else _bands(film.channels)
+    axis.set_title(f"{film.width} x {film.height} pixels, {channels}")
+    axis.grid(alpha=0.3, which="both")
+    axis.legend(fontsize="small")
+    _save(figure, path)
+
+
+def _turned(setting: Setting, usual: Setting) -> str:
+    """Which knob a setting turns beside the samples."""
+    if setting.bands:
+        return "bands for colour"
+    if setting.shrink > 1:
+        return "smaller picture"
+    if setting.dtype != usual.dtype:
+        return setting.dtype
+    return "shorter paths" if setting.depth != usual.depth else "samples alone"
+
+
+def _mark_words(setting: Setting, kind: str) -> str:
+    """What tells a point from the others of its kind."""
+    which = {"bands for colour": setting.bands, "shorter paths": setting.depth}
+    if kind == "smaller picture":
+        return f"1/{setting.shrink}"
+    return str(which.get(kind, setting.samples))
 
 
 # One glass.

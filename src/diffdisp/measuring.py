@@ -1,0 +1,409 @@
+"""What accuracy costs: error and time of a picture over the knobs of the renderer."""
+
+import csv
+import hashlib
+import json
+import math
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from diffdisp.chunks import check_glasses, film_range
+from diffdisp.color import VISIBLE
+from diffdisp.film import Film, band_middles
+from diffdisp.image import Picture, linear_rgb, read_picture, replacing
+from diffdisp.planning import make_plan
+from diffdisp.programs import surroundings
+from diffdisp.rendering import render
+from diffdisp.scene import Scene
+from diffdisp.scene_file import save_scene
+from diffdisp.tolerance import FALL, difference, relative, rms
+
+MOST_SAMPLES = 256
+"""Samples per pixel of the best pictures that are measured, unless others are asked for."""
+
+MIDDLE = 16
+"""Samples per pixel at which, and at four times which, the other knobs are turned."""
+
+DEPTHS = (2, 4, 8, 16)
+BANDS = (4, 8, 16, 32)
+"""Numbers of bands over the visible range that stand for colour."""
+SHRINKS = (2, 4)
+"""By which a picture is smaller that is blown up again."""
+
+REFERENCE = 4
+"""Times as many samples as the best picture has, of the reference; where light scatters, of each
+of two whose mean it is."""
+
+KNOWN = 3.0
+"""An error is known if it is so many times the reference's own."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Where the knobs are.
+
+    Args:
+        samples: per pixel.
+        depth: segments a path may have.
+        dtype: float32 or float64.
+        bands: that stand for colour; 0 for the film's own bands or colour.
+        shrink: by which the picture's edges are shorter, before it is blown up again.
+    """
+
+    samples: int
+    depth: int
+    dtype: str = "float32"
+    bands: int = 0
+    shrink: int = 1
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What one setting gives and takes.
+
+    Args:
+        error: root mean square of the picture's error over that of the reference, whose own share
+            is taken off.
+        delta_e_mean: mean colour difference of the pixels as a screen shows them, CIE ΔE2000; NaN
+            for bands that are not visible.
+        delta_e_p99: the colour difference that one pixel in a hundred exceeds.
+        compile_s: time to compile, once for each kind of scene.
+        render_s: time of a render after that, median of five.
+        cpu_s: the same of all cores together.
+        peak_memory_mb: of a process that does this alone.
+    """
+
+    error: float
+    delta_e_mean: float
+    delta_e_p99: float
+    compile_s: float
+    render_s: float
+    cpu_s: float
+    peak_memory_mb: float
+
+
+class Tradeoff(NamedTuple):
+    """The measured settings of a scene.
+
+    Args:
+        settings: in the order of measuring.
+        measured: of each.
+        reference_error: of the reference, over its root mean square.
+        reference_samples: per pixel.
+        film: of the pictures.
+    """
+
+    settings: tuple[Setting, ...]
+    measured: tuple[Measured, ...]
+    reference_error: float
+    reference_samples: int
+    film: Film
+
+    @property
+    def front(self) -> tuple[int, ...]:
+        """Numbers of the settings than which none is both faster and nearer, the fastest first."""
+        order = sorted(range(len(self.measured)), key=lambda i: self.measured[i].render_s)
+        best, found = np.inf, []
+        for number in order:
+            if self.measured[number].error < best:
+                best = self.measured[number].error
+                found.append(number)
+        return tuple(found)
+
+    @property
+    def sweep(self) -> tuple[int, ...]:
+        """Numbers of the settings in which the samples alone differ, and whose errors are known."""
+        first = replace(self.settings[0], samples=0)
+        return tuple(
+            number
+            for number, (setting, row) in enumerate(zip(self.settings, self.measured, strict=True))
+            if replace(setting, samples=0) == first and row.error > KNOWN * self.reference_error
+        )
+
+    @property
+    def fall(self) -> float:
+        """Power of the number of samples by which the error falls."""
+        rows = [(float(self.settings[i].samples), self.measured[i].error) for i in self.sweep]
+        return -_slope(rows)
+
+    @property
+    def price(self) -> float:
+        """Times as long a picture takes whose error is half as large."""
+        rows = [(self.measured[i].error, self.measured[i].render_s) for i in self.sweep]
+        return float(2.0 ** -_slope(rows[len(rows) // 2 :]))  # few samples cost less than the rest
+
+    def fastest(self, error: float) -> int | None:
+        """Number of the fastest setting with at most this error, if there is one."""
+        return next((i for i in self.front if self.measured[i].error <= error), None)
+
+
+def _slope(rows: Sequence[tuple[float, float]]) -> float:
+    """Slope of the second over the first of pairs, in logarithms; NaN of fewer than two."""
+    if len(rows) < 2:
+        return float("nan")
+    x, y = np.log(np.array(rows, float)).T
+    return float(np.polyfit(x, y, 1)[0])
+
+
+def knob_grid(scene: Scene, film: Film, most: int, depth: int) -> tuple[Setting, ...]:
+    """The settings to measure: the samples at which all else is best, then one knob at a time.
+
+    Args:
+        scene: as in `tradeoff`.
+        film: as in `tradeoff`.
+        most: as in `tradeoff`.
+        depth: as in `tradeoff`.
+    """
+    plan = make_plan(scene, film, 1, depth, "float32")
+    counts = [1 << power for power in range(most.bit_length()) if 1 << power <= most]
+    middles = [count for count in (MIDDLE, 4 * MIDDLE) if count <= most] or counts[-1:]
+    found = [Setting(samples, depth) for samples in counts]
+    for samples in middles:
+        base = Setting(samples, depth)
+        found.append(replace(base, dtype="float64"))
+        if plan.first_lamp > 0:  # something sends light on
+            found += [replace(base, depth=few) for few in DEPTHS if few < depth]
+        if plan.dispersive and film.wavelengths is None:
+            found += [replace(base, bands=bands) for bands in BANDS]
+        found += [
+            replace(base, shrink=shrink)
+            for shrink in SHRINKS
+            if min(film.width, film.height) >= shrink
+        ]
+    return tuple(found)
+
+
+def tradeoff(
+    scene: Scene,
+    size: tuple[int, int],
+    bands: tuple[float, float, int] | None,
+    folder: str | os.PathLike[str],
+    *,
+    most: int = MOST_SAMPLES,
+    depth: int = 50,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> Tradeoff:
+    """Measure what the accuracy of a scene's picture costs.
+
+    Each setting is drawn by a process of its own, which compiles it anew. What has been measured is
+    kept in the folder, and is not measured again when the same is asked for on the same machine.
+
+    Args:
+        scene: as in `render`.
+        size: width and height, pixels.
+        bands: lowest and highest wavelength in nm, and the number of bands; None for colour.
+        folder: exists; `tradeoff.csv` and `reference.npz` go there.
+        most: samples per pixel of the best pictures.
+        depth: segments of the best pictures' paths.
+        seed: of the pictures; the reference takes the next ones.
+        progress: called with the settings done and their number. An exception that it raises stops
+            the work.
+
+    Raises:
+        ValueError: as in `render`.
+        RuntimeError: a process that measures failed.
+    """
+    folder = Path(folder)
+    film = Film(*size, None if bands is None else band_middles(*bands))
+    check_glasses(scene, *film_range(film))
+    settings = knob_grid(scene, film, most, depth)
+    with tempfile.TemporaryDirectory() as scratch:
+        saved = Path(scratch) / "scene.toml"
+        save_scene(scene, saved)
+        asked = json.dumps([saved.read_text(encoding="utf-8"), size, bands, most, depth, seed])
+        key = hashlib.sha256(f"{asked} {surroundings()}".encode()).hexdigest()
+        rows = dict(_kept_rows(folder, key))
+        tell = progress or (lambda done, of: None)
+        tell(len(rows), len(settings))
+        reference, own_error = _reference(scene, film, folder, key, most, depth, seed)
+        for setting in settings:
+            if setting in rows:
+                continue
+            drawing = _Drawing(saved, size, bands, seed)
+            picture, timing = _drawn(drawing, setting, Path(scratch))
+            rows[setting] = Measured(*_errors(picture, reference, own_error), **timing)
+            _keep_rows(folder, key, rows)
+            tell(len(rows), len(settings))
+    measured = tuple(rows[setting] for setting in settings)
+    return Tradeoff(settings, measured, own_error, REFERENCE * most, film)
+
+
+# The reference.
+
+
+def _reference(
+    scene: Scene, film: Film, folder: Path, key: str, most: int, depth: int, seed: int
+) -> tuple[Picture, float]:
+    """A converged picture, and the root mean square of its error over its own."""
+    path = folder / "reference.npz"
+    kept = _kept_reference(path, key)
+    if kept is not None:
+        return kept
+    scattering = make_plan(scene, film, most, depth, "float64").scattering
+    counts = (REFERENCE * most,) * 2 if scattering else (most, REFERENCE * most)
+    one, other = (
+        render(scene, film, samples=count, depth=depth, seed=seed + number, dtype="float64")
+        for number, count in enumerate(counts, start=1)
+    )
+    apart = rms(np.asarray(one) - other)
+    if scattering:
+        radiance, error = (np.asarray(one) + other) / 2, apart / 2
+    else:
+        radiance, error = (
+            np.asarray(other),
+            apart / difference(most, REFERENCE * most) * REFERENCE**-FALL,
+        )
+    own_error = relative(error, rms(radiance))
+    wavelengths = None if film.wavelengths is None else np.asarray(film.wavelengths)
+    arrays: dict[str, Any] = {"radiance": radiance, "error": own_error, "key": key}
+    if wavelengths is not None:
+        arrays["wavelength"] = wavelengths
+    with replacing(path) as beside, beside.open("wb") as file:
+        np.savez(file, **arrays)
+    return Picture(radiance, wavelengths), own_error
+
+
+def _kept_reference(path: Path, key: str) -> tuple[Picture, float] | None:
+    """The reference that was drawn for the same before."""
+    try:
+        with np.load(path) as stored:
+            if str(stored["key"]) != key:
+                return None
+            return read_picture(path), float(stored["error"])
+    except (OSError, ValueError, KeyError):
+        return None
+
+
+# One setting.
+
+
+class _Drawing(NamedTuple):
+    """What every setting draws."""
+
+    scene: Path
+    size: tuple[int, int]
+    bands: tuple[float, float, int] | None
+    seed: int
+
+
+def _drawn(drawing: _Drawing, setting: Setting, scratch: Path) -> tuple[Picture, dict[str, float]]:
+    """The picture of a setting, in full size, and what it took.
+
+    Raises:
+        RuntimeError: the process that draws it failed.
+    """
+    output = scratch / "picture.npz"
+    width, height = drawing.size
+    size = f"{-(-width // setting.shrink)}x{-(-height // setting.shrink)}"
+    words: list[object] = ["render", drawing.scene, "-o", output, "--size", size, "--timing"]
+    words += ["--samples", setting.samples, "--depth", setting.depth, "--seed", drawing.seed]
+    bands = (*VISIBLE, setting.bands) if setting.bands else drawing.bands
+    if bands:
+        words += ["--bands", ":".join(format(part, "g") for part in bands)]
+    if setting.dtype == "float64":
+        words.append("--float64")
+    with tempfile.TemporaryDirectory(dir=scratch) as empty:  # what is kept there is compiled anew
+        done = subprocess.run(
+            [sys.executable, "-m", "diffdisp", *map(str, words)],
+            env={**os.environ, "JAX_COMPILATION_CACHE_DIR": empty},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+    if done.returncode == 130:
+        raise KeyboardInterrupt
+    if done.returncode:
+        raise RuntimeError(f"diffdisp {' '.join(map(str, words))}: {done.stderr.strip()}")
+    told = json.loads(done.stdout)
+    picture = read_picture(output)
+    if setting.bands:
+        picture = Picture(linear_rgb(picture))
+    rows, columns = (np.arange(edge) // setting.shrink for edge in (height, width))
+    whole = Picture(picture.radiance[rows][:, columns], picture.wavelengths)
+    names = [field.name for field in fields(Measured) if field.name in told]
+    return whole, {name: told[name] for name in names}
+
+
+def _errors(picture: Picture, reference: Picture, own_error: float) -> tuple[float, float, float]:
+    """The errors of a picture, as in `Measured`."""
+    size = rms(reference.radiance)
+    apart = rms(picture.radiance - reference.radiance)
+    error = relative(math.sqrt(max(apart**2 - (own_error * size) ** 2, 0.0)), size)
+    try:
+        seen, true = linear_rgb(picture), linear_rgb(reference)
+    except ValueError:
+        return error, float("nan"), float("nan")
+    difference = delta_e(seen, true)
+    return error, float(difference.mean()), float(np.percentile(difference, 99))
+
+
+def delta_e(
+    one: Float[np.ndarray, "height width 3"], other: Float[np.ndarray, "height width 3"]
+) -> Float[np.ndarray, "height width"]:
+    """Colour difference of each pixel on a screen that shows (1, 1, 1) as its white.
+
+    Args:
+        one: linear sRGB; what a screen cannot show is clipped.
+        other: the same.
+
+    Returns:
+        CIE ΔE2000, dimensionless.
+
+    Source:
+        CIE 142-2001, by colour-science.
+    """
+    import colour
+
+    white = colour.CCS_ILLUMINANTS["CIE 1931 2 Degree Standard Observer"]["D65"]
+
+    def lab(rgb: np.ndarray) -> Any:
+        shown = np.clip(rgb.astype(np.float64), 0.0, 1.0)
+        xyz = colour.RGB_to_XYZ(shown, "sRGB", apply_cctf_decoding=False)
+        return colour.XYZ_to_Lab(xyz, white)
+
+    return np.asarray(colour.delta_E(lab(one), lab(other), method="CIE 2000"))
+
+
+# Rows that are kept.
+
+
+_FIELDS = [field.name for kind in (Setting, Measured) for field in fields(kind)]
+
+
+def _keep_rows(folder: Path, key: str, rows: dict[Setting, Measured]) -> None:
+    """Write tradeoff.csv, whole or not at all."""
+    with (
+        replacing(folder / "tradeoff.csv") as beside,
+        beside.open("w", encoding="utf-8", newline="") as file,
+    ):
+        writer = csv.DictWriter(file, [*_FIELDS, "key"])
+        writer.writeheader()
+        for setting, row in rows.items():
+            writer.writerow({**asdict(setting), **asdict(row), "key": key})
+
+
+def _kept_rows(folder: Path, key: str) -> Iterator[tuple[Setting, Measured]]:
+    """What tradeoff.csv holds that was measured for the same."""
+    try:
+        with (folder / "tradeoff.csv").open(encoding="utf-8", newline="") as file:
+            kept = [row for row in csv.DictReader(file) if row.get("key") == key]
+        for row in kept:
+            yield _of_row(Setting, row), _of_row(Measured, row)
+    except (OSError, ValueError, KeyError):
+        return
+
+
+def _of_row(kind: Any, row: dict[str, str]) -> Any:
+    """A setting, or what was measured of one, from a line of the file."""
+    types: dict[str, Any] = {field.name: field.type for field in fields(kind)}
+    return kind(**{name: parse(row[name]) for name, parse in types.items()})
