@@ -366,7 +366,7 @@ def test_a_tradeoff_as_a_table():
     # Two that are worse than another one, and one beyond what the reference tells.
     assert lines[6].startswith("   16 samples, depth 2 ")
     assert lines[7].startswith("   16 samples, depth 50, float64 ")
-    assert lines[8].startswith("*  16 samples, depth 50, 8 bands  <0.005 ")
+    assert lines[8].startswith("*  16 samples, depth 50, 8 bands   <0.005 ")
     assert lines[9].startswith("   16 samples, depth 50, 1/2 size ")
     assert lines[11:] == [
         "For 10% take 4 samples, depth 50: 0.4 s.",
