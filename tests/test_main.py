@@ -207,9 +207,8 @@ BAD_OPTIONS = {
     "no output": ("", "-o OUT"),
     "timing without output": ("--plan --timing", "-o OUT"),
     "tolerance 0": ("-o {out}/a.png --tolerance 0", "must be above 0; found '0'"),
-    "tolerance and samples": ("-o {out}/a.png --tolerance 1 --samples 4", "not allowed with"),
+    "tolerance and samples": ("-o {out}/a.png --tolerance 1 --samples 4", "leave out --samples"),
     "tolerance and quality": ("-o {out}/a.png --tolerance 1 --quality draft", "not allowed with"),
-    "samples and quality": ("-o {out}/a.png --samples 4 --quality draft", "not allowed with"),
     "unknown suffix": ("-o {out}/a.jpg", "found '.jpg'"),
     "no suffix": ("-o {out}/a", ".npz, .png"),
     "missing folder": ("-o {out}/no/a.png", "there is no folder"),
@@ -630,6 +629,13 @@ def test_a_tolerance_chooses_the_samples(lit, out, capsys):
     assert timing["samples"] == picture.samples
     assert timing["paths"] == 8 * 6 * picture.samples
     assert timing["estimated_error"] == pytest.approx(float(told[2]), rel=0.05)
+
+
+def test_the_plan_of_a_tolerance_says_that_samples_are_chosen(lit, capsys):
+    assert main(["render", lit, "--plan", "--tolerance", "0.1"]) == 0
+    assert capsys.readouterr().out.endswith(
+        "\ntolerance  0.1: other samples, chosen while drawing\n"
+    )
 
 
 def test_a_tolerance_that_is_not_reached(lit, out, capsys, monkeypatch):

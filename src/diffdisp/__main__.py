@@ -158,10 +158,10 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
     add("-o", dest="output", metavar="OUT", help=".png (sRGB), .tiff or .exr (float32), .npz")
     add("--size", type=_size, default=(480, 480), metavar="WxH", help="pixels (default 480x480)")
     accuracy = parser.add_mutually_exclusive_group()
-    often = accuracy.add_argument
-    often("--quality", choices=QUALITY, help=f"samples per pixel: {presets} (default standard)")
-    often("--samples", type=_count, metavar="N", help="samples per pixel")
-    often("--tolerance", type=_positive, metavar="T", help=_TOLERANCE_HELP)
+    quality = f"samples per pixel: {presets} (default standard)"
+    accuracy.add_argument("--quality", choices=QUALITY, help=quality)
+    accuracy.add_argument("--tolerance", type=_positive, metavar="T", help=_TOLERANCE_HELP)
+    add("--samples", type=_count, metavar="N", help="samples per pixel (default: by --quality)")
     add("--depth", type=_depth, default=50, metavar="N", help="segments of a path (default 50)")
     add("--bands", type=_bands, metavar="LOW:HIGH:COUNT", help=_BANDS_HELP)
     add("--float64", action="store_true", help="compute in double precision (default: single)")
@@ -327,6 +327,8 @@ def _render(options: argparse.Namespace) -> int:
     """`diffdisp render`."""
     if not options.output and (options.timing or not options.plan):
         raise ValueError("render needs -o OUT; only --plan goes without a picture")
+    if options.tolerance and options.samples:
+        raise ValueError("--tolerance chooses the samples; leave out --samples")
     from diffdisp.image import check_output
     from diffdisp.planning import make_plan
     from diffdisp.scene_file import load_scene
@@ -340,6 +342,8 @@ def _render(options: argparse.Namespace) -> int:
     _check_glasses(scene, options.bands)
     if options.plan:
         print(make_plan(scene, film, samples, options.depth, dtype))
+        if options.tolerance:
+            print(f"tolerance  {options.tolerance:g}: other samples, chosen while drawing")
     if not options.output:
         return DONE
     _keep_compiled()
