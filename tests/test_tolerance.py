@@ -4,7 +4,7 @@ from helpers import ORIGIN, ball, bench, camera, furnace, ground, lamp, matte, s
 
 from diffdisp.film import Film
 from diffdisp.material import Lambertian
-from diffdisp.rendering import render
+from diffdisp.rendering import Growing, render
 from diffdisp.scene import Scene
 from diffdisp.tolerance import SHARE, difference, render_to_tolerance, rms
 
@@ -95,10 +95,11 @@ def test_where_light_scatters_only_very_fine_tolerances_take_double_precision():
     assert dtypes == ["float32", "float64"]
 
 
-def test_what_is_out_of_reach_is_refused_at_once():
+@pytest.mark.parametrize("tolerance", [1e-9, 1e-300])
+def test_what_is_out_of_reach_is_refused_at_once(tolerance):
     drawn = []
     with pytest.raises(ValueError, match=r"out of reach: about \S+ samples a pixel"):
-        drawn.extend(render_to_tolerance(LIT, SMALL, 1e-9, dtype="float64"))
+        drawn.extend(render_to_tolerance(LIT, SMALL, tolerance, dtype="float64"))
     assert len(drawn) == 1
 
 
@@ -117,6 +118,24 @@ def test_progress_counts_the_parts_of_all_pictures_at_hand(scene):
     *_, _last = drawn
     assert told[-1][0] == told[-1][1]
     assert all(0 < done <= total for done, total in told)
+
+
+def test_a_picture_that_may_be_all_noise_takes_more_samples(monkeypatch):
+    """Light that one sample in a hundred finds; of the first few one alone, in one place."""
+    rng = np.random.default_rng(0)
+
+    def drawn(_scene, film, samples, _depth, seed, *_rest):
+        found = rng.binomial(samples, 0.01, (film.height, film.width, 3)) / samples
+        first = np.zeros((film.height, film.width, 3))
+        first[0, 0] = seed == 0
+        yield Growing(found if samples > 2 else first, samples)
+
+    monkeypatch.setattr("diffdisp.tolerance.passes", drawn)
+    pictures = list(render_to_tolerance(LIT, SMALL, 0.5, dtype="float64"))
+    assert np.isinf(pictures[0].error)
+    assert pictures[-1].error <= 0.5
+    # One in a hundred: a relative error of 1/2 takes some 400 samples.
+    assert 200 < pictures[-1].samples < 1600
 
 
 def test_of_a_picture_with_many_more_samples_the_difference_is_the_first_ones_error():

@@ -46,6 +46,9 @@ ROUNDED = 4
 MOST_GROWTH = 16
 """Times as many samples as before, at most: what is foreseen from afar is foreseen badly."""
 
+MOST_FORESEEN = 1e12
+"""Times as large as the tolerance that an error counts at most: out of reach by far."""
+
 MOST_PLANNED = 1 << 12
 """Samples that a picture is planned with at most; where that is too few another one follows."""
 
@@ -178,7 +181,7 @@ def _in_pairs(
             yield mean.astype(one.radiance.dtype), now, found
             if found <= tolerance or now >= OUT_OF_REACH:
                 return
-        wanted = now * (found / tolerance) ** (1.0 / FALL)
+        wanted = _wanted(now, found, tolerance)
         if not samples:
             _check_reach(wanted)
         total, squared, samples = total + both, off, now
@@ -238,7 +241,7 @@ def _enough(
         error = relative(error, rms(of(finer)))
         if error <= tolerance:
             return samples, error
-        wanted = samples * (error / tolerance) ** (1.0 / FALL)
+        wanted = _wanted(samples, error, tolerance)
         _check_reach(wanted)
         growing = min(math.ceil(wanted), MOST_GROWTH * samples)
         samples = max(_planned(growing, MOST_SAMPLES), 2 * samples)
@@ -261,6 +264,13 @@ def relative(error: float, size: float) -> float:
     if error == 0:
         return 0.0
     return error / size if size > 0 else math.inf
+
+
+def _wanted(samples: int, error: float, tolerance: float) -> float:
+    """Samples that an error within the tolerance takes, where so many have this one."""
+    if math.isinf(error):  # all that is seen yet may be noise
+        return float(MOST_GROWTH * samples)
+    return samples * min(error / tolerance, MOST_FORESEEN) ** (1.0 / FALL)
 
 
 def _check_reach(wanted: float) -> None:
