@@ -1033,7 +1033,7 @@ def test_tradeoff(lit, out, capsys, monkeypatch):
     assert main(words) == 0
     told = capsys.readouterr().out
     assert "\n*  1 sample, depth 4 " in told
-    assert "The reference has 8 samples a pixel" in told
+    assert "The reference has 16 samples a pixel" in told
     assert {file.name for file in folder.iterdir()} == {
         "tradeoff.csv",
         "tradeoff.png",

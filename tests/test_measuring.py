@@ -106,7 +106,7 @@ def test_settings_are_measured_once(two_settings, tmp_path, monkeypatch):
     found = tradeoff(LIT, SIZE, None, tmp_path, **knobs)
     assert told == [(0, 2), (1, 2), (2, 2)]
     assert found.settings == two_settings
-    assert found.reference_samples == 8
+    assert found.reference_samples == 16  # two pictures of 4 · 2
     for row in found.measured:
         assert 0 < row.error < 1
         assert 0 < row.delta_e_mean < row.delta_e_p99

@@ -362,16 +362,19 @@ def _draw_samples(
     def write(picture: Growing) -> None:
         _write_picture(options, film, *picture, options.seed)
 
-    knobs["samples"] = samples
     if options.timing:
-        compiling = {name: value for name, value in knobs.items() if name != "seed"}
-        build = partial(compile_ahead, scene, film, **compiling)
-        radiance, timing = _timed(build, partial(render, scene, film, **knobs))
+        static = {"samples": samples, "depth": options.depth, "dtype": knobs["dtype"]}
+        build = partial(compile_ahead, scene, film, **static)
+        radiance, timing = _timed(build, partial(render, scene, film, samples=samples, **knobs))
         write(Growing(radiance, samples))
         _print_timing(timing, film, samples)
         return DONE
-    draw = partial(render_progressively, scene, film, **knobs)
-    picture = _grow(draw, write, lambda p: f"{p.samples} of {samples} samples", options.output)
+    draw = partial(render_progressively, scene, film, samples=samples, **knobs)
+
+    def tell(picture: Growing | None) -> str:
+        return f"{picture.samples if picture else 0} of {samples} samples"
+
+    picture = _grow(draw, write, tell, options.output)
     return INTERRUPTED if picture is None else DONE
 
 
@@ -408,8 +411,10 @@ def _draw_to_tolerance(
     return DONE
 
 
-def _estimate(picture: Any) -> str:
+def _estimate(picture: Any | None) -> str:
     """What was chosen for a picture, and how good it is."""
+    if picture is None:
+        return "0 samples"
     error = "not known" if math.isinf(picture.error) else f"{picture.error:.2g}"
     return f"{picture.samples} samples a pixel in {picture.dtype}, estimated error {error}"
 
@@ -454,7 +459,7 @@ def _check_glasses(scene: Any, bands: tuple[float, float, int] | None) -> None:
 def _grow(
     draw: Callable[..., Iterator[Any]],
     write: Callable[[Any], None],
-    tell: Callable[[Any], str],
+    tell: Callable[[Any | None], str],
     output: str,
 ) -> Any:
     """Draw and write a picture, with a progress bar; on Ctrl-C what there is of it by then.
@@ -462,7 +467,7 @@ def _grow(
     Args:
         draw: given what is told the progress, the pictures on the way.
         write: one of them.
-        tell: how far one of them is.
+        tell: how far one of them is; of None, how far the work is before the first.
         output: what is written.
 
     Returns:
@@ -471,6 +476,7 @@ def _grow(
     picture = None
     try:
         with _progress_bar("rendering", "part") as bar:
+            bar.set_postfix_str(tell(None), refresh=False)
             for picture in draw(progress=lambda done, total: _advance(bar, done, total)):
                 bar.set_postfix_str(tell(picture))
         assert picture is not None

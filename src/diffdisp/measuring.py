@@ -25,7 +25,7 @@ from diffdisp.programs import surroundings
 from diffdisp.rendering import render
 from diffdisp.scene import Scene
 from diffdisp.scene_file import save_scene
-from diffdisp.tolerance import FALL, difference, relative, rms
+from diffdisp.tolerance import FALL, correlation, difference, relative, rms
 
 MOST_SAMPLES = 256
 """Samples per pixel of the best pictures that are measured, unless others are asked for."""
@@ -235,7 +235,8 @@ def tradeoff(
             _keep_rows(folder, key, rows)
             tell(len(rows), len(settings))
     measured = tuple(rows[setting] for setting in settings)
-    return Tradeoff(settings, measured, own_error, REFERENCE * most, film)
+    assert reference.samples is not None
+    return Tradeoff(settings, measured, own_error, reference.samples, film)
 
 
 # The reference.
@@ -249,28 +250,27 @@ def _reference(
     kept = _kept_reference(path, key)
     if kept is not None:
         return kept
-    scattering = make_plan(scene, film, most, depth, "float64").scattering
-    counts = (REFERENCE * most,) * 2 if scattering else (most, REFERENCE * most)
+    plan, finest = make_plan(scene, film, most, depth, "float64"), REFERENCE * most
+    counts = (finest if plan.scattering else most, finest)
     one, other = (
         render(scene, film, samples=count, depth=depth, seed=seed + number, dtype="float64")
         for number, count in enumerate(counts, start=1)
     )
     apart = rms(np.asarray(one) - other)
-    if scattering:
-        radiance, error = (np.asarray(one) + other) / 2, apart / 2
+    if plan.scattering:
+        radiance, samples, error = (np.asarray(one) + other) / 2, 2 * finest, apart / 2
     else:
-        radiance, error = (
-            np.asarray(other),
-            apart / difference(most, REFERENCE * most) * REFERENCE**-FALL,
-        )
+        of_first = apart / difference(most, finest, correlation(plan))
+        radiance, samples, error = np.asarray(other), finest, of_first * REFERENCE**-FALL
     own_error = relative(error, rms(radiance))
     wavelengths = None if film.wavelengths is None else np.asarray(film.wavelengths)
-    arrays: dict[str, Any] = {"radiance": radiance, "error": own_error, "key": key}
+    arrays: dict[str, Any] = {"radiance": radiance, "samples": samples}
+    arrays |= {"error": own_error, "key": key}
     if wavelengths is not None:
         arrays["wavelength"] = wavelengths
     with replacing(path) as beside, beside.open("wb") as file:
         np.savez(file, **arrays)
-    return Picture(radiance, wavelengths), own_error
+    return Picture(radiance, wavelengths, samples), own_error
 
 
 def _kept_reference(path: Path, key: str) -> tuple[Picture, float] | None:
@@ -280,7 +280,7 @@ def _kept_reference(path: Path, key: str) -> tuple[Picture, float] | None:
             if str(stored["key"]) != key:
                 return None
             return read_picture(path), float(stored["error"])
-    except (OSError, ValueError, KeyError):
+    except Exception:  # whatever is wrong with a kept reference, it can be drawn again
         return None
 
 
@@ -309,7 +309,7 @@ def _drawn(drawing: _Drawing, setting: Setting, scratch: Path) -> tuple[Picture,
     words += ["--samples", setting.samples, "--depth", setting.depth, "--seed", drawing.seed]
     bands = (*VISIBLE, setting.bands) if setting.bands else drawing.bands
     if bands:
-        words += ["--bands", ":".join(format(part, "g") for part in bands)]
+        words += ["--bands", ":".join(map(str, bands))]
     if setting.dtype == "float64":
         words.append("--float64")
     with tempfile.TemporaryDirectory(dir=scratch) as empty:  # what is kept there is compiled anew
@@ -399,7 +399,7 @@ def _kept_rows(folder: Path, key: str) -> Iterator[tuple[Setting, Measured]]:
             kept = [row for row in csv.DictReader(file) if row.get("key") == key]
         for row in kept:
             yield _of_row(Setting, row), _of_row(Measured, row)
-    except (OSError, ValueError, KeyError):
+    except (OSError, ValueError, KeyError, TypeError):
         return
 
 

@@ -231,7 +231,7 @@ def _one_pass(
 ) -> Float[np.ndarray, "height width channels"]:
     """The mean of the samples of one pass over the picture."""
     if work.tiles is not None:
-        _, run, spectrum = _of_pass(work, seed, number)
+        run, spectrum = _of_pass(work, seed, number)
         return _wavefront_pass(work, film, spectrum, run, progress)
     every = np.arange(film.width * film.height)
     values = _pixels_of_pass(work, film, seed, number, every, progress)
@@ -272,7 +272,7 @@ def _pixels_of_pass(
     progress: Progress | None = None,
 ) -> Float[np.ndarray, "pixels channels"]:
     """The mean of the samples of one pass by the direct loop, of some pixels."""
-    plan, run, spectrum = _of_pass(work, seed, number)
+    plan, (run, spectrum) = work.plan, _of_pass(work, seed, number)
     chunks, place = some_blocks(pixels, film.width, 1.0, chunk_pixels(film, plan))
     fixed = (plan, work.scene, spectrum, film_size(film))
     values = over_chunks(
@@ -281,11 +281,11 @@ def _pixels_of_pass(
     return values.reshape(-1, film.channels)[place]
 
 
-def _of_pass(work: _Work, seed: int, number: int) -> tuple[Plan, RunNumbers, Spectrum]:
-    """The plan, the numbers and the spectrum of one pass."""
+def _of_pass(work: _Work, seed: int, number: int) -> tuple[RunNumbers, Spectrum]:
+    """The numbers and the spectrum of one pass."""
     cells = np.roll(work.cells, -number, axis=0)
     run = run_numbers(work.plan, seed, cells=cells)
-    return work.plan, run, _spectrum_of(work, cells[0])
+    return run, _spectrum_of(work, cells[0])
 
 
 def _spectrum_of(work: _Work, cells: np.ndarray) -> Spectrum:
@@ -406,7 +406,7 @@ def compile_ahead(scene: Scene, film: Film, *, samples: int, depth: int, dtype: 
         dtype: "float32" or "float64".
     """
     work = _lay_out(scene, film, samples, depth, dtype, seed=0)
-    plan, run, spectrum = _of_pass(work, 0, 0)
+    plan, (run, spectrum) = work.plan, _of_pass(work, seed=0, number=0)
     if work.tiles is None:
         chunks, _ = all_pixels(film, chunk_pixels(film, plan))
         fixed = (plan, work.scene, spectrum, film_size(film))

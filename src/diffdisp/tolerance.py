@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from diffdisp.chunks import check_glasses, film_range
 from diffdisp.film import Film
-from diffdisp.planning import make_plan
+from diffdisp.planning import Plan, make_plan
 from diffdisp.rendering import Growing, Progress, passes, some_pixels
 from diffdisp.sampling import sample_grid
 from diffdisp.scene import Scene
@@ -142,8 +142,7 @@ def render_to_tolerance(
         single, double = (shown(ROUNDED, seed, name) for name in ("float32", "float64"))
         if relative(rms(single - double), rms(double)) > tolerance / 3:
             dtype = "float64"
-    alike = 0.0 if plan.random else ALIKE
-    samples, error = _enough(partial(shown, dtype=dtype), tolerance, seed, alike)
+    samples, error = _enough(partial(shown, dtype=dtype), tolerance, seed, correlation(plan))
     for picture in passes(scene, film, samples, depth, seed, dtype, progress):
         whole = picture.samples == samples
         yield Estimated(*picture, error if whole else math.inf, seed, dtype)
@@ -247,13 +246,18 @@ def _enough(
         samples = max(_planned(growing, MOST_SAMPLES), 2 * samples)
 
 
-def difference(samples: int, finer: int, alike: float = ALIKE) -> float:
+def correlation(plan: Plan) -> float:
+    """Of the errors of two pictures that differ in samples and seed; of no scattered light."""
+    return 0.0 if plan.random else ALIKE
+
+
+def difference(samples: int, finer: int, alike: float) -> float:
     """Difference of two pictures over the error of the first of them.
 
     Args:
         samples: of the first.
         finer: of the second, more than that.
-        alike: correlation of both errors: 0 of independent ones.
+        alike: `correlation` of both errors.
     """
     later = (samples / finer) ** FALL
     return math.sqrt(1.0 + later**2 - 2.0 * alike * later)
