@@ -1032,7 +1032,10 @@ def test_tradeoff(lit, out, capsys, monkeypatch):
     words = ["tradeoff", lit, "-o", str(folder), *SMALL]
     assert main(words) == 0
     told = capsys.readouterr().out
-    assert "\n*  1 sample, depth 4 " in told
+    # Which of the two is the faster is the machine's own matter; one is on the front.
+    marks = re.findall(r"^([* ])  [12] samples?, depth 4 ", told, re.MULTILINE)
+    assert len(marks) == 2
+    assert "*" in marks
     assert "The reference has 16 samples a pixel" in told
     assert {file.name for file in folder.iterdir()} == {
         "tradeoff.csv",
