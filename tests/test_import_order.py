@@ -15,6 +15,7 @@ ORDER = (
     "fresnel",
     "geometry",
     "texture",
+    "outline",
     "material",
     "camera",
     "scene",

@@ -32,6 +32,7 @@ from diffdisp.geometry import (
     sphere_distances,
 )
 from diffdisp.material import Dielectric, Emitter, Lambertian, Material, Metal
+from diffdisp.outline import part_within
 from diffdisp.planning import Plan
 from diffdisp.sampling import Numbers, sharing, uniform_direction
 from diffdisp.scene import Object, Scene, is_glass, texture_of
@@ -700,9 +701,9 @@ def arriving(
     """Mean radiance over a footprint whose middle meets a surface that ends paths.
 
     Lamps end at their silhouettes, and infinite screens at their horizons, which count where
-    outlines are soft. Of a footprint across such an edge each side counts by its part, the straight
-    edge that touches the surface there taken for it; of several, the nearer ones hide the others by
-    their parts. Where a ball of glass may be beside the edge, all counts as what the middle meets.
+    outlines are soft. Of a footprint across such an edge each side counts by its part; of several,
+    the nearer ones hide the others by their parts. Where a ball of glass may be beside the edge,
+    all counts as what the middle meets.
 
     Args:
         surface: what the middle meets.
@@ -764,11 +765,12 @@ def _lamp_seen(row: int, path: Path, tables: "Tables", plan: Plan, one: Array | 
         world.radii[plan.first_plane + row],
     )
     assert path.footprint is not None
-    along, depth, edges = sphere_depth(path.ray, path.footprint, center, radius)
+    along, depth, _ = sphere_depth(path.ray, path.footprint, center, radius)
     root = radius * safe_sqrt(depth, least_square(depth))
     offset = path.ray.origin - center
     around = offset.dot(offset) < radius * radius
-    part = jnp.where(around, 1.0, jnp.where(along > 0, covered(depth, *edges), 0.0))
+    within = part_within(path.ray, path.footprint, center, radius)
+    part = jnp.where(around, 1.0, jnp.where(along > 0, within, 0.0))
     place = number - plan.balls + tables.first_row
     light = tuple(_pick(mean, place) for mean in tables.paint.mean)
     if plan.cubed[True]:
