@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,30 +16,45 @@ from diffdisp.film import Film, band_middles
 from diffdisp.fitting import (
     COLOR_WAVELENGTHS,
     CUTOFF,
+    FOR_SLOPES,
     PROFILE,
     Coefficients,
+    Descent,
+    Drawing,
     FitResult,
+    Level,
     Point,
+    Problem,
+    Rendered,
     StopFit,
     Unknowns,
     _counted,
     _covariance,
     _crossed,
+    _drawn_within,
     _in_order,
     _in_pixels,
     _level,
     _linearise,
+    _marked,
     _mean_place,
     _more_samples,
+    _n_d,
+    _next_point,
     _probabilities,
     _problem,
+    _reach,
+    _reduced,
+    _rendering_words,
+    _samples_within,
     _slopes_by_chance,
+    _together,
     expected_uncertainty,
     fit,
 )
 from diffdisp.glasses import glass_table, named_glass
 from diffdisp.image import Picture, read_picture, write_picture
-from diffdisp.linearised import Columns, linearise
+from diffdisp.linearised import Columns, Linearised, linearise
 from diffdisp.rendering import render
 from diffdisp.scene import Scene, with_glass
 from diffdisp.scene_file import load_scene
@@ -394,6 +410,8 @@ def two_balls(glass: Sellmeier = BK7) -> Scene:
         (bench(), {"object_name": "screen"}, "no glass ball is called 'screen'"),
         (bench(), {"free": ["ball.weight"]}, "nothing called 'ball.weight' can be free"),
         (bench(), {"free": ["gain", "gain"]}, "gain is free twice"),
+        (bench(), {"tolerance": 0.0}, "tolerance 0.0: must be a finite number above 0"),
+        (bench(), {"tolerance": np.inf}, "tolerance inf: must be a finite number above 0"),
         (bench(NOTHING), {}, "nothing is free"),
         (bench(), {"start": glass_of_index(1.5)}, "nothing is free"),
         (bench(), {"start": Sellmeier([1.0] * 3, [0.01, 0.3025, 100.0])}, "pole at 550 nm"),
@@ -403,7 +421,7 @@ def two_balls(glass: Sellmeier = BK7) -> Scene:
 def test_what_cannot_be_fitted_is_refused(scene, options, words):
     with pytest.raises(ValueError, match=words):
         fit(scene, ONE, **options)
-    if not options.keys() & {"start", "loss", "check"}:  # of a picture that is there
+    if not options.keys() & {"start", "loss", "check", "tolerance"}:  # of a picture that is there
         with pytest.raises(ValueError, match=words):
             expected_uncertainty(scene, ONE.film, **{"noise": NOISE, **options})
 
@@ -787,17 +805,39 @@ def test_outlines_are_where_a_ball_ends():
     assert np.sum(seen) > 4 * circle
 
 
-def test_a_fit_draws_every_pixel_as_well_as_the_noise_asks():
-    blank = Picture(np.zeros((SIZE, SIZE, 8)), VISIBLE.wavelengths)
-    used, free = np.ones((SIZE, SIZE), bool), ("ball.center", "ball.radius")
+def without_target(scene: Scene, film: Film, free: tuple[str, ...] = ()) -> Problem:
+    """What a fit to a black picture starts from."""
+    blank = Picture(np.zeros((film.height, film.width, film.channels)), film.wavelengths)
+    used = np.ones((film.height, film.width), bool)
+    return _problem(scene, 0, blank, used, free, "none", "squares", lambda *_: None)
+
+
+class Drawn(NamedTuple):
+    """A displaced ball, its place and size free: as many samples show it, and few."""
+
+    truth: np.ndarray
+    problem: Problem
+    at: Point
+    few: Linearised
+    level: Level
+    some: Linearised
+
+
+@pytest.fixture(scope="module")
+def places_free() -> Drawn:
     truth = np.asarray(render(displaced(BK7), VISIBLE, samples=4096, dtype="float64"))
     with jax.enable_x64(True):
-        fixed = used, free, "none", "squares", lambda *_: None
-        problem = _problem(displaced(BK7), 0, blank, *fixed)
+        problem = without_target(displaced(BK7), VISIBLE, ("ball.center", "ball.radius"))
         at = Point(problem.unknowns.coefficients.start(), np.zeros(4))
         few = _linearise(problem, _level(problem, "", 1, 4, DEPTH, 0), at, CUTOFF)
         level = _level(problem, "", 1, 4, DEPTH, 0, 2)
         some = _linearise(problem, level, at, CUTOFF)
+    return Drawn(truth, problem, at, few, level, some)
+
+
+def test_a_fit_draws_every_pixel_as_well_as_the_noise_asks(places_free):
+    truth, problem, at, few, level, some = places_free
+    with jax.enable_x64(True):
         level, _ = _more_samples(problem, level, few, some, at, DEPTH, NOISE)
         drawn = _linearise(problem, level, at, CUTOFF, some.columns, of_index=True).picture
     off = (drawn.reshape(truth.shape) - truth) / NOISE
@@ -807,6 +847,126 @@ def test_a_fit_draws_every_pixel_as_well_as_the_noise_asks():
     # Of 3872 values: far below what noise makes of them by chance, which is 90.
     assert np.sum(weights * off**2) < 10
     assert np.min(weights) > 0.9
+
+
+# --- a tolerance of n_d
+
+
+def test_with_places_free_n_d_is_drawn_to_a_tolerance(places_free):
+    truth, problem, at, few, level, some = places_free
+    with jax.enable_x64(True):
+        problem = problem._replace(tolerance=2e-4)
+        level, slopes = _samples_within(problem, level, few, some, at, DEPTH, NOISE)
+        drawn = _linearise(problem, level, at, CUTOFF, some.columns, of_index=True)
+        reach = _reach(problem, level, drawn, at)
+    off = np.sum(reach * (drawn.picture - truth.reshape(drawn.picture.shape)), axis=1)
+    # n_d is mixed up with the place: 16 samples leave an estimated 8e-4 open.
+    assert level.rendering.met
+    assert level.rendering.refinements > 0
+    assert abs(np.sum(off)) < 1.2 * 2e-4
+    finest, of_slopes = (max(part.split for part in each.parts) for each in (level, slopes))
+    assert of_slopes == min(finest, FOR_SLOPES)
+
+
+@pytest.fixture(scope="module")
+def many_samples() -> Picture:
+    """A picture that does not say how it was drawn: its own error of n_d is some 1e-6."""
+    radiance = render(bench(BK7), VISIBLE, samples=1024, dtype="float64")
+    return Picture(np.asarray(radiance), VISIBLE.wavelengths)
+
+
+def test_a_fit_to_a_tolerance_is_within_it(many_samples):
+    rough, fine = (fit(bench(SILICA), many_samples, tolerance=T) for T in (1e-3, 3e-5))
+    for result in (rough, fine):
+        assert result.converged, result.message
+        assert result.rendering.met
+        assert abs(result.n_d - float(BK7.n_d)) < 1.2 * result.rendering.tolerance
+    # All pixels with 16 samples, extrapolated from 4, are enough for the one and not for the other.
+    assert rough.rendering.refinements == 0
+    assert rough.samples == (4, 16)
+    assert fine.rendering.refinements > 0
+    assert fine.samples[:2] == (4, 16) < fine.samples
+    assert fine.rendering.error < rough.rendering.error
+    assert "rendering leaves n_d open by an estimated" in fine.summary
+
+
+def test_a_tolerance_out_of_reach_is_said(many_samples, monkeypatch):
+    monkeypatch.setattr("diffdisp.fitting.SPLITS", (2, 4))
+    result = fit(bench(SILICA), many_samples, tolerance=1e-9)
+    assert result.converged, result.message
+    assert not result.rendering.met
+    assert result.samples == (4, 16, 64)
+    assert "samples allowed, 64 a pixel: the tolerance of 1e-09 is not met." in result.summary
+
+
+def test_a_target_that_says_its_samples_is_drawn_with_them(visible, visible_fit):
+    result = fit(bench(SILICA), visible, tolerance=1e-2)
+    assert result.rendering == Rendered(1e-2, 0.0, 0)
+    assert result.n_d == visible_fit.n_d
+    assert "The fit drew the picture as the target says" in result.summary
+    assert visible_fit.rendering is None
+
+
+def test_what_the_picture_leaves_open_is_told_apart():
+    words = _rendering_words(Rendered(1e-5, 4e-6, 2), 256, 2e-4)
+    assert words.endswith(
+        "The picture fixes n_d to ±2.0e-04: the tolerance of 1e-05 is met by the fit's own"
+        " rendering, not by the picture."
+    )
+    assert "±" not in _rendering_words(Rendered(1e-5, 4e-6, 2), 256, 9e-6)
+    assert _rendering_words(None, 256, 1e-5) == ""
+
+
+def test_what_holds_most_is_refined():
+    off = np.array([1.0, -4.0, 0.0, 0.5, 3.0])
+    np.testing.assert_array_equal(_marked(off), [False, True, False, False, True])
+    np.testing.assert_array_equal(_marked(0 * off), [False] * 5)
+    # Those that cancel do so by chance.
+    assert _together(np.array([3.0, -3.0])) == pytest.approx(np.sqrt(18))
+    assert _together(np.array([3.0, 1.0])) == pytest.approx(np.sqrt(16 + 10))
+
+
+def test_n_d_follows_the_picture_as_foreseen(visible):
+    with jax.enable_x64(True):
+        problem = without_target(bench(BK7), VISIBLE)
+        problem = problem._replace(target=visible.radiance)
+        at = Point(problem.unknowns.coefficients.start(), np.zeros(0))
+        level = _level(problem, "", 1, SAMPLES, DEPTH, 0)
+        weights = np.random.default_rng(0).uniform(0.2, 1.0, level.weights.shape)
+        level = level._replace(weights=weights)
+        lin = _linearise(problem, level, at, CUTOFF)
+        change = np.random.default_rng(1).normal(0.0, 1e-4, lin.picture.shape)
+        moved = _reduced(level, lin.picture + change, lin.columns)
+        new, _ = _next_point(problem.unknowns, at, at.z, moved, 0.0)
+        foreseen = np.sum(_reach(problem, level, lin, at) * change)
+        found = _n_d(problem.unknowns, new.z) - float(BK7.n_d)
+    # n_d is hardly bent within so little.
+    assert abs(found) > 1e-8
+    assert foreseen == pytest.approx(found, rel=0.05)
+
+
+def test_a_picture_by_chance_is_drawn_to_a_tolerance(monkeypatch):
+    with jax.enable_x64(True):
+        problem = without_target(on_matte_ground(BK7), FEW_BANDS)
+        at = Point(problem.unknowns.coefficients.start(), np.zeros(0))
+        level = _slopes_by_chance(problem, DEPTH, 0)
+        level = level._replace(drawing=Drawing(256, DEPTH, 0, apart=True))
+        lin = _linearise(problem, level, at, CUTOFF)
+        end = Descent(at, lin, 1, True, 0.0, at.z)
+
+        def drawn(tolerance: float) -> tuple[int, Rendered]:
+            found = _drawn_within(problem._replace(tolerance=tolerance), level, end)
+            return found.drawing.samples, found.rendering
+
+        samples, rough = drawn(1.0)
+        assert (samples, rough.refinements) == (256, 0)
+        samples, fine = drawn(0.6 * rough.error)
+        assert (samples, fine.refinements) == (1024, 1)  # a power of two above 256 / 0.36
+        assert fine.error == pytest.approx(rough.error / 2)
+        monkeypatch.setattr("diffdisp.fitting.MOST_DRAWN", 600 * 24 * 24 * 3)
+        samples, out_of_reach = drawn(1e-9)
+        assert samples == 512
+        assert not out_of_reach.met
 
 
 @pytest.mark.parametrize("middle", [0.0, 0.4, -1.1])

@@ -22,6 +22,7 @@ from diffdisp import __main__ as command_line
 from diffdisp import fitting
 from diffdisp.__main__ import main
 from diffdisp.film import Film
+from diffdisp.fitting import Rendered
 from diffdisp.image import Picture, read_picture, write_picture
 from diffdisp.measuring import Setting
 from diffdisp.rendering import Growing, render_progressively
@@ -263,6 +264,8 @@ def test_bad_option(scene, out, capsys, options, phrase):
         ("render . -o a.png", "cannot be read"),
         ("fit scene.toml", "required"),
         ("fit nosuch.toml nosuch.npz -o a", "nosuch.toml"),
+        ("fit a.toml a.npz -o a --tolerance 0", "must be above 0"),
+        ("fit a.toml a.npz -o a --tolerance nan", "must be a finite number"),
         ("plan-fit scene.toml -o a", "--noise"),
         ("plan-fit nosuch.toml --noise 1e-3 -o a", "nosuch.toml"),
         ("glass", "GLASS"),
@@ -794,15 +797,14 @@ def test_glass_without_an_index_in_the_visible(tmp_path, capsys):
 @pytest.fixture
 def fitted(monkeypatch):
     """What `fit` was asked for; it answers `converged`."""
-    asked = {"converged": True}
+    asked = {"converged": True, "rendering": None}
 
     def fit(scene, target, *, progress, **options):
         asked.update(options, shape=target.radiance.shape)
         progress(1, 0.1, 1.5)
         progress(2, 0.01, 1.51)
-        return fake_result(
-            target.wavelengths, 2, picture=target.radiance, converged=asked["converged"]
-        )
+        told = {name: asked[name] for name in ("converged", "rendering")}
+        return fake_result(target.wavelengths, 2, picture=target.radiance, **told)
 
     monkeypatch.setattr("diffdisp.fitting.fit", fit)
     return asked
@@ -823,6 +825,7 @@ def test_fit(scene, target, out, capsys, fitted):
     assert fitted["start"] is None
     assert fitted["mask"] is None
     assert (fitted["loss"], fitted["check"]) == ("squares", None)
+    assert fitted["tolerance"] is None
 
 
 def test_fit_options(scene, target, out, fitted):
@@ -833,6 +836,22 @@ def test_fit_options(scene, target, out, fitted):
     assert fitted["start"].name == "F2"
     assert fitted["free"] == ["ball.center", "gain"]
     assert (fitted["loss"], fitted["check"]) == ("robust", "resample")
+
+
+def test_fit_to_a_tolerance(scene, target, out, capsys, fitted):
+    fitted["rendering"] = Rendered(1e-4, 3e-5, 1)
+    assert main(["fit", scene, target, "-o", str(out), "--tolerance", "1e-4"]) == 0
+    assert fitted["tolerance"] == 1e-4
+    told = capsys.readouterr()
+    assert "rendering  n_d to an estimated 3.0e-05 by 16 to 144 samples a pixel" in told.out
+    assert told.err == ""
+
+
+def test_fit_to_a_tolerance_out_of_reach(scene, target, out, capsys, fitted):
+    fitted["rendering"] = Rendered(1e-9, 3e-8, 5)
+    assert main(["fit", scene, target, "-o", str(out), "--tolerance", "1e-9"]) == 3
+    assert "diffdisp: not reached: n_d to an estimated 3.0e-08" in capsys.readouterr().err
+    assert {file.name for file in out.iterdir()} == {"fit.json", "report.png"}
 
 
 def test_fit_with_a_mask(scene, target, tmp_path, out, fitted):

@@ -1,5 +1,6 @@
 import json
 import warnings
+from dataclasses import replace
 
 import imageio.v3 as iio
 import numpy as np
@@ -8,7 +9,7 @@ from fake_fit import BANDS, blurred_ring, fake_expected, fake_result, fake_targe
 
 from diffdisp.dispersion import Sellmeier
 from diffdisp.film import Film
-from diffdisp.fitting import FreeValue, Resampled
+from diffdisp.fitting import FreeValue, Rendered, Resampled
 from diffdisp.glasses import named_glass
 from diffdisp.image import Picture
 from diffdisp.measuring import Measured, Setting, Tradeoff
@@ -33,7 +34,7 @@ KEYS = {
     *("n_d_std", "V_d", "V_d_std", "P_gF", "wavelength", "n", "n_std", "singular_values"),
     *("determined", "summary", "rms_residual", "nearest_glasses"),
     *("object", "prior", "P_gF_std", "free", "left_out", "loss", "other_glass_probability"),
-    *("stopped", "check"),
+    *("stopped", "check", "rendering"),
 }
 LEFT_OUT = ("masked_pixels", "clipped_values", "outlying_values")
 
@@ -95,6 +96,17 @@ def test_how_likely_the_nearest_glasses_are(tmp_path):
     write_report(tmp_path / "a.png", result, fake_target())
     write_report(tmp_path / "b.png", fake_result(), fake_target())
     assert (tmp_path / "a.png").read_bytes() != (tmp_path / "b.png").read_bytes()
+
+
+def test_what_a_tolerance_chose_is_told():
+    assert fit_json(fake_result())["rendering"] is None
+    assert "rendering" not in result_table(fake_result())
+    result = fake_result(rendering=Rendered(1e-5, 4e-6, 2))
+    told = {"tolerance": 1e-5, "error": 4e-6, "refinements": 2, "samples": [16, 144]}
+    assert fit_json(result)["rendering"] == told
+    words = "n_d to an estimated 4.0e-06 by 16 to 144 samples a pixel, 2 refinements; tolerance"
+    assert f"rendering  {words} 1e-05\n" in result_table(result)
+    assert "by 16 samples a pixel" in result_table(replace(result, samples=(16,)))
 
 
 def test_a_check_is_told():
@@ -305,7 +317,7 @@ def test_what_to_expect_as_json(tmp_path):
     write_bench_json(tmp_path / "plan.json", fake_bench())
     read = json.loads((tmp_path / "plan.json").read_text(encoding="utf-8"))
     of_fits_alone = {"converged", "message", "stopped", "steps", "rms_residual", "loss"}
-    of_fits_alone |= {"nearest_glasses", "other_glass_probability", "check"}
+    of_fits_alone |= {"nearest_glasses", "other_glass_probability", "check", "rendering"}
     own = {"noise", "size", "variations", "left_out"}
     assert read.keys() == (KEYS - of_fits_alone) | own == bench_json(fake_bench()).keys()
     assert read["variations"][0] == {

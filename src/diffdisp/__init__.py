@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from diffdisp.fitting import (
         FitResult,
         FreeValue,
+        Rendered,
         Resampled,
         StopFit,
         Uncertainty,
@@ -51,6 +52,7 @@ __all__ = [
     "Picture",
     "Plan",
     "Plane",
+    "Rendered",
     "Resampled",
     "Scene",
     "SceneError",
@@ -105,6 +107,7 @@ _NAMES = {
     "fitting": (
         "FitResult",
         "FreeValue",
+        "Rendered",
         "Resampled",
         "StopFit",
         "Uncertainty",

@@ -180,7 +180,8 @@ _BANDS_HELP = "nm; equal bands, seen at their middles, as 400:700:16 (default: c
 def _add_fit(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Recover B and C of a glass ball from a picture. The scene says where everything is and "
-        "which glass to start from. Exit status 3: it did not converge; the files are written. "
+        "which glass to start from. Exit status 3: it did not converge, or not within the "
+        "tolerance; the files are written. "
         "Ctrl-C writes the best point so far; the exit status is 130 then."
     )
     parser.set_defaults(run=_fit)
@@ -194,12 +195,17 @@ def _add_fit(parser: argparse.ArgumentParser) -> None:
     add("--loss", choices=LOSSES, default="squares", help="robust: outliers do not count")
     add("--check", action="store_true", help="of n_d's error, by resampling the residual")
     add("--noise", type=_positive, metavar="SIGMA", help="of the radiance (default: estimated)")
+    add("--tolerance", type=_positive, metavar="T", help=_FIT_TOLERANCE_HELP)
     add("--start", metavar="GLASS", help="glass to start from (default: that of the scene)")
     add(
         "--mask", metavar="FILE", help="a picture of TARGET's size; where it is 0 nothing is fitted"
     )
 
 
+_FIT_TOLERANCE_HELP = (
+    "as many samples as make the error that the fit's own rendering leaves in n_d an estimated T "
+    "at most (default: by the noise)"
+)
 _FREE_HELP = (
     "fit this too, from its value in the scene: ball.center, ball.radius, ball.center.z, "
     "screen.point, screen.tile, camera.vertical_fov, ...; gain, a factor for each band; black, "
@@ -523,7 +529,7 @@ def _fit(options: argparse.Namespace) -> int:
     from diffdisp.fitting import fit
     from diffdisp.glasses import load_glass
     from diffdisp.image import read_mask, read_picture
-    from diffdisp.report import result_table, write_fit_json, write_report
+    from diffdisp.report import rendering_words, result_table, write_fit_json, write_report
     from diffdisp.scene_file import load_scene
 
     scene, target = load_scene(options.scene), read_picture(options.target)
@@ -547,6 +553,7 @@ def _fit(options: argparse.Namespace) -> int:
             mask=mask,
             loss=options.loss,
             check="resample" if options.check else None,
+            tolerance=options.tolerance,
             progress=progress,
         )
     folder.mkdir(parents=True, exist_ok=True)
@@ -555,6 +562,8 @@ def _fit(options: argparse.Namespace) -> int:
     print(result_table(result))
     if result.stopped:
         return _complain(f"interrupted: {folder} holds the fit so far", INTERRUPTED)
+    if result.rendering and not result.rendering.met:
+        return _complain(f"not reached: {rendering_words(result)}", NOT_CONVERGED)
     return DONE if result.converged else NOT_CONVERGED
 
 

@@ -119,6 +119,19 @@ TOLERATED = 0.1
 alike in all channels, without still more samples. At 256 samples those on the outline of the
 bench's ball are as far off as a noise of 1 % of that mean; at 4096 an eighth of that."""
 
+MARKED = 0.75
+"""Part of what pixels leave open of n_d that is held by those of the next refinement, where a
+tolerance of n_d says how many samples there are."""
+
+LEFT = 1 / 3
+"""Part of a change by four times the samples that is left after it, or less: it falls about as the
+area of a footprint. On the bench in 64² pixels n_d is 7.5e-5, 1.9e-5, 7.0e-6 and 1.0e-6 off with
+4, 16, 64 and 256 samples; extrapolated by that part, 5e-7, 3e-6 and 1e-6."""
+
+SURE = 1.5
+"""Standard deviations of a render by chance that count as its error: 0.93 of them are within 1.2
+times that."""
+
 HELD = 1e3
 """Weight against which directions that are held move, where the residual's norm is 1."""
 
@@ -227,6 +240,26 @@ class Resampled(NamedTuple):
     repeats: int
     n_d_std: float
     ratio: float
+
+
+class Rendered(NamedTuple):
+    """What a fit's own render leaves open of n_d, where a tolerance was asked for.
+
+    Args:
+        tolerance: of n_d.
+        error: estimated error of n_d by what so many samples leave open; 0 where the target says
+            how it was drawn and is drawn so.
+        refinements: how many times samples were raised, after the first for all pixels.
+    """
+
+    tolerance: float
+    error: float
+    refinements: int
+
+    @property
+    def met(self) -> bool:
+        """Whether the error is within the tolerance."""
+        return self.error <= self.tolerance
 
 
 class FreeValue(NamedTuple):
@@ -342,6 +375,8 @@ class FitResult:
         stopped: whether it was told to stop; all else is then of the best point so far, and
             `picture` is 0 where nothing had been rendered.
         check: of the errors, where one was asked for and something depends on the glass.
+        rendering: what the fit's own render leaves open of n_d; None where no tolerance was asked
+            for, or the fit was stopped before its last level.
     """
 
     scene: Scene
@@ -382,6 +417,7 @@ class FitResult:
     other_probability: float = float("nan")
     stopped: bool = False
     check: Resampled | None = None
+    rendering: Rendered | None = None
 
     @property
     def masked(self) -> int:
@@ -548,6 +584,8 @@ class Problem(NamedTuple):
         loss: one of `LOSSES`.
         progress: called with the step, the root mean square residual and n_d.
         kept: the best point so far, and its level, once there is one; it is kept up to date.
+        tolerance: of n_d, for the error that the fit's own render makes; None for as many samples
+            as the target's noise asks for.
     """
 
     scene: Scene
@@ -562,6 +600,7 @@ class Problem(NamedTuple):
     loss: str
     progress: Callable[[int, float, float], None]
     kept: "list[tuple[Level, Descent]]"
+    tolerance: float | None = None
 
 
 class Part(NamedTuple):
@@ -607,6 +646,7 @@ class Level(NamedTuple):
         robust: the loss; None for squares.
         drawing: the render that the picture is, where light scatters by chance; the parts are then
             for slopes alone. None where the parts are the picture.
+        rendering: what its samples leave open of n_d, where a tolerance was asked for.
     """
 
     name: str
@@ -619,6 +659,7 @@ class Level(NamedTuple):
     clipped: Clipped | None
     robust: Robust | None
     drawing: "Drawing | None" = None
+    rendering: Rendered | None = None
 
 
 class Drawing(NamedTuple):
@@ -650,6 +691,7 @@ def fit(
     mask: np.ndarray | None = None,
     loss: str = "squares",
     check: str | None = None,
+    tolerance: float | None = None,
     progress: Callable[[int, float, float], None] | None = None,
 ) -> FitResult:
     """The Sellmeier coefficients of a glass ball from a picture of it, in float64.
@@ -679,6 +721,11 @@ def fit(
             round at random, which shows whether the error reported of n_d is the spread that
             noise of this kind gives it. It takes the picture as linear near the answer, and does
             not know errors of the scene or of the render.
+        tolerance: of n_d, for the error that the fit's own render makes: samples are raised, of
+            those pixels first that count most for n_d, until the estimate of that error is within
+            it. By default there are as many as make it small beside the noise. What the picture's
+            noise leaves open is not changed by it. A target that says its `samples` is drawn with
+            them all the same.
         progress: called with the step, the root mean square residual and n_d. It may raise
             `StopFit`.
 
@@ -691,9 +738,11 @@ def fit(
         ValueError: no such glass ball, or several and no name; a start with a pole in the band or
             without any free coefficient; an unknown prior; a noise that is not positive; a name
             in `free` that the scene does not have; a mask of another size, or that leaves
-            nothing; values that are used and not finite.
+            nothing; values that are used and not finite; a tolerance that is not positive.
     """
     _check_known(prior, noise)
+    if tolerance is not None and not (np.isfinite(tolerance) and tolerance > 0):
+        raise ValueError(f"tolerance {tolerance}: must be a finite number above 0")
     if loss not in LOSSES:
         raise ValueError(f"loss {loss!r}: allowed are {', '.join(LOSSES)}")
     if check is not None and check not in CHECKS:
@@ -706,6 +755,7 @@ def fit(
     target = replace(target, radiance=np.where(used[..., None], target.radiance, 0.0))
     with jax.enable_x64(True):
         problem = _problem(scene, number, target, used, free, prior, loss, progress or _silent)
+        problem = problem._replace(tolerance=tolerance)
         return _fit(problem, target, prior, noise, check)
 
 
@@ -1501,7 +1551,7 @@ def _n_d(unknowns: Unknowns, z: np.ndarray) -> float:
 def _refined(
     problem: Problem, few: Descent, level: Level, depth: int
 ) -> tuple[tuple[Level, Level], Point]:
-    """Whole pictures with samples as `_more_samples` says, and the point to go on from.
+    """Whole pictures with samples as the noise or the tolerance asks for, and where to go on from.
 
     Args:
         problem: what stays the same.
@@ -1513,7 +1563,8 @@ def _refined(
     at, _ = _next_point(problem.unknowns, few.at, few.at.z, some, 0.0)
     residual = np.abs(some.score)[some.weight > 0]
     shown = _deviation(residual, np.ones_like(residual))
-    return _more_samples(problem, level, few.lin, some, few.at, depth, shown), at
+    choose = _more_samples if problem.tolerance is None else _samples_within
+    return choose(problem, level, few.lin, some, few.at, depth, shown), at
 
 
 def _own_noise(problem: Problem, level: Level, lin: Linearised, at: Point) -> float:
@@ -1525,14 +1576,20 @@ def _own_noise(problem: Problem, level: Level, lin: Linearised, at: Point) -> fl
         lin: the picture and its slopes.
         at: where they are.
     """
+    change = _drawn_twice(problem, level, at)
+    return float(np.sqrt(np.mean(change[lin.weight.any(axis=1)] ** 2) / 2))
+
+
+def _drawn_twice(problem: Problem, level: Level, at: Point) -> np.ndarray:
+    """How two drawn pictures of different seeds differ (blocks, channels)."""
     assert level.drawing is not None
     first, second = (
         _drawn(problem, level.drawing._replace(seed=seed, apart=True), at)
         for seed in (level.seed, ~level.seed)
     )
     gains, _ = problem.free.exposure(at.others)
-    change = ((first - second) * gains).reshape(-1, problem.film.channels)[level.blocks]
-    return float(np.sqrt(np.mean(change[lin.weight.any(axis=1)] ** 2) / 2))
+    change: np.ndarray = ((first - second) * gains).reshape(-1, problem.film.channels)
+    return change[level.blocks]
 
 
 def _drawn_enough(problem: Problem, level: Level, own: float, noise: float) -> tuple[Level, float]:
@@ -1544,18 +1601,44 @@ def _drawn_enough(problem: Problem, level: Level, own: float, noise: float) -> t
         own: its own noise.
         noise: of the target's values.
     """
-    film, drawing = problem.film, level.drawing
-    assert drawing is not None
+    film = problem.film
     # The channels of a colour picture are drawn by the same paths, and err alike.
     alike = 1 if film.wavelengths is not None else film.channels
     least = CLEAN * problem.free.brightest
-    wanted = drawing.samples * alike * (own / (QUIET * max(noise, least))) ** 2
+    level, left = _drawn_more(problem, level, alike * (own / (QUIET * max(noise, least))) ** 2)
+    return level, own * left
+
+
+def _drawn_within(problem: Problem, level: Level, end: Descent) -> Level:
+    """A level drawn with as many samples as the tolerance of n_d asks for.
+
+    Args:
+        problem: what stays the same.
+        level: the whole picture, drawn with few.
+        end: where the steps on it ended.
+    """
+    assert problem.tolerance is not None
+    reach = _reach(problem, level, end.lin, end.at)
+    off = np.sum(reach * _drawn_twice(problem, level, end.at), axis=1)
+    error = SURE * float(np.linalg.norm(off) / np.sqrt(2))
+    drawn, left = _drawn_more(problem, level, (error / problem.tolerance) ** 2)
+    raised = int(drawn.drawing != level.drawing)
+    return drawn._replace(rendering=Rendered(problem.tolerance, error * left, raised))
+
+
+def _drawn_more(problem: Problem, level: Level, times: float) -> tuple[Level, float]:
+    """A level drawn with so many times the samples, no fewer; the part of its noise that is left.
+
+    No more than `MOST_DRAWN` paths are drawn, though.
+    """
+    film, drawing = problem.film, level.drawing
+    assert drawing is not None
     most = max(MOST_DRAWN // (film.width * film.height * film.channels), 1)
     # Powers of two have divisors to go through them by.
-    enough = min(np.ceil(np.log2(max(wanted, 1.0))), np.floor(np.log2(most)))
-    samples = max(2 ** int(enough), drawing.samples)
-    left = own * np.sqrt(drawing.samples / samples)
-    return level._replace(drawing=drawing._replace(samples=samples)), float(left)
+    wanted = np.ceil(np.log2(max(drawing.samples * times, 1.0)))
+    samples = max(2 ** int(min(wanted, np.floor(np.log2(most)))), drawing.samples)
+    left = float(np.sqrt(drawing.samples / samples))
+    return level._replace(drawing=drawing._replace(samples=samples)), left
 
 
 def _more_samples(
@@ -1599,10 +1682,8 @@ def _more_samples(
     changed, outlined = np.max(change, axis=1), np.zeros(len(change), bool)
     if of_scene:
         shows |= np.any(some.columns.values[:, :, :of_scene], axis=(0, 2))
-        beside = _near(problem, level.blocks, shows.astype(float)) > 0
-        scene = _with_others(problem, at.others)
-        crossed = _crossed(scene, problem.film)
-        outlined = beside & np.any(_in_pixels(crossed), axis=(1, 2))[level.blocks]
+        crossed = _crossed(_with_others(problem, at.others), problem.film)
+        outlined = _outlined(problem, level, shows, crossed)
         told = np.where(shows, changed, -1.0)
         splits, most = SPLITS, REFINED
     else:
@@ -1634,14 +1715,7 @@ def _more_samples(
             along = rows[outlined[rows]]
             error[along] = _near(problem, level.blocks[along], error[along])
     pairs.append((rows, splits))
-
-    def drawn(rows: np.ndarray, path: tuple[int, ...]) -> list[Part]:
-        *_, fewer, more = (0, *path)
-        ratio = (more / fewer) ** 2 if fewer else np.inf
-        shares = (fewer, -1 / (ratio - 1)), (more, 1 + 1 / (ratio - 1))
-        few = partial(_part, problem, 1, FEW_SAMPLES, depth, level.blocks[rows], rows)
-        return [few(split, share) for split, share in shares if split and len(rows)]
-
+    drawn = partial(_extrapolated, problem, level, depth)
     parts = [part for rows, path in pairs for part in drawn(rows, path)]
     pairs.append((cut, splits))
     short = [(rows, tuple(k for k in path if k <= FOR_SLOPES)) for rows, path in pairs]
@@ -1659,6 +1733,118 @@ def _more_samples(
         parts += outlines
     weighed = level._replace(weights=1 / (1 + (error[:, None] / sigma) ** 2))
     return weighed._replace(parts=tuple(parts)), weighed._replace(parts=tuple(for_slopes))
+
+
+def _samples_within(
+    problem: Problem,
+    level: Level,
+    few: Linearised,
+    some: Linearised,
+    at: Point,
+    depth: int,
+    noise: float,
+) -> tuple[Level, Level]:
+    """A whole picture with as many samples as the tolerance of n_d asks for.
+
+    What more samples change in each pixel, times how far n_d follows it, tells what is left open.
+    Those pixels that hold most of it get four times the samples, and so on. All pixels of an
+    outline that a number of the scene moves go together: see `_more_samples`, also for the
+    arguments and what is returned.
+
+    Source:
+        Dörfler, SIAM J. Numer. Anal. 33 (1996) 1106: refining what holds a fixed part of the error;
+        Becker and Rannacher, Acta Numerica 10 (2001) 1: errors weighed by what is looked for.
+    """
+    tolerance, sigma = problem.tolerance, max(noise, CLEAN * problem.free.brightest)
+    assert tolerance is not None
+    of_scene = len(problem.free.parameters)
+    outlined = np.zeros(len(level.blocks), bool)
+    if of_scene:
+        moves = np.any(some.columns.values[:, :, :of_scene], axis=(0, 2))
+        crossed = _crossed(_with_others(problem, at.others), problem.film)
+        outlined = _outlined(problem, level, some.weight.any(axis=1) | moves, crossed)
+    gains, black = problem.free.exposure(at.others)
+    picture, change = some.picture.copy(), some.picture - few.picture
+    splits, refinements = np.full(len(picture), SPLITS[0]), 0
+    while True:
+        error = LEFT * np.max(np.abs(change), axis=1, keepdims=True)
+        level = level._replace(weights=1 / (1 + (error / sigma) ** 2))
+        best = _reduced(level, picture + LEFT * change, some.columns)
+        off = LEFT * np.sum(_reach(problem, level, best, at) * change, axis=1)
+        left, coarse = _together(off), splits < SPLITS[-1]
+        if left <= tolerance or _together(off[~coarse]) > tolerance or not np.any(off[coarse]):
+            break
+        chosen = _marked(off * coarse)
+        if np.any(outlined & chosen):
+            chosen |= outlined & coarse
+        for split in np.unique(splits[chosen]).tolist():
+            rows = np.flatnonzero(chosen & (splits == split))
+            part = _part(problem, 1, FEW_SAMPLES, depth, level.blocks[rows], rows, 2 * split)
+            traced = _trace(problem, part, at, level.seed, CUTOFF, False, False)
+            finer = traced[:, 0] * gains + black
+            change[rows], picture[rows] = finer - picture[rows], finer
+        splits[chosen] *= 2
+        refinements += 1
+    level = level._replace(rendering=Rendered(tolerance, left, refinements))
+
+    def drawn(splits: np.ndarray) -> Level:
+        each = [(np.flatnonzero(splits == split), split) for split in np.unique(splits).tolist()]
+        drawn = partial(_extrapolated, problem, level, depth)
+        parts = [part for rows, split in each for part in drawn(rows, (split // 2, split))]
+        return level._replace(parts=tuple(parts))
+
+    return drawn(splits), drawn(np.minimum(splits, FOR_SLOPES) if of_scene else splits)
+
+
+def _reach(problem: Problem, level: Level, lin: Linearised, at: Point) -> np.ndarray:
+    """How far n_d follows each value (blocks, channels) of the picture, per unit of it."""
+    coefficients, left, z = problem.unknowns.coefficients, lin.eliminated(), jnp.asarray(at.z)
+    noise = max(lin.noise, CLEAN * problem.free.brightest)
+    logs = _answer(problem.unknowns, z, left, noise).logs[:, : len(left.r)]
+    of_n_d = _along_logs(coefficients, lambda z: _line_figures(coefficients, z), z)[0]
+    told = np.concatenate([np.zeros(problem.free.total), of_n_d @ logs / noise])
+    # Least squares: of a band that shows nothing R has a row of zeros.
+    change = np.linalg.lstsq(lin.r, told)[0]
+    return -level.weights * lin.columns.along(change)
+
+
+def _together(off: Float[np.ndarray, " blocks"]) -> float:
+    """What errors make together: their sum, where they may cancel by chance, and their spread."""
+    return float(np.hypot(np.sum(off), np.linalg.norm(off)))
+
+
+def _marked(off: Float[np.ndarray, " blocks"]) -> np.ndarray:
+    """Which errors (blocks,), the largest, hold `MARKED` of all."""
+    order = np.argsort(-np.abs(off))
+    held = np.cumsum(np.abs(off[order]))
+    marked = np.zeros(len(off), bool)
+    marked[order[: np.searchsorted(held, MARKED * held[-1]) + 1]] = True
+    return marked & (off != 0)
+
+
+def _extrapolated(
+    problem: Problem, level: Level, depth: int, rows: np.ndarray, path: tuple[int, ...]
+) -> list[Part]:
+    """What renders some rows with the last of some splits, extrapolated from the one before it."""
+    *_, fewer, more = (0, *path)
+    ratio = (more / fewer) ** 2 if fewer else np.inf
+    shares = (fewer, -1 / (ratio - 1)), (more, 1 + 1 / (ratio - 1))
+    few = partial(_part, problem, 1, FEW_SAMPLES, depth, level.blocks[rows], rows)
+    return [few(split, share) for split, share in shares if split and len(rows)]
+
+
+def _outlined(problem: Problem, level: Level, shows: np.ndarray, crossed: np.ndarray) -> np.ndarray:
+    """Which blocks hold an outline, one that is near what `shows` (blocks,) something.
+
+    Args:
+        problem: what stays the same.
+        level: the resolution, of single pixels.
+        shows: which blocks show something of what is free.
+        crossed: of `_crossed`.
+    """
+    beside = _near(problem, level.blocks, shows.astype(float)) > 0
+    outlined: np.ndarray = beside & np.any(_in_pixels(crossed), axis=(1, 2))[level.blocks]
+    return outlined
 
 
 def _outlines(
@@ -1987,7 +2173,7 @@ def _search(problem: Problem, target: Picture) -> "tuple[Level, Descent]":
         (finest, level), at = _refined(problem, best, along, depth)
     else:
         level, at = _level(problem, LAST, 1, target.samples, depth, seed), best.at
-        finest = level
+        finest = level = _as_told(problem, level)
     best = _descend(problem, level, at, CUTOFF, 30, small, along)
     if level.robust is not None:
         tukey = Robust("tukey", best.spread)
@@ -2004,6 +2190,13 @@ def _search(problem: Problem, target: Picture) -> "tuple[Level, Descent]":
         slopes = level if level.drawing is None else _slopes_by_chance(problem, depth, seed)
         best = _polished(problem, finest, slopes, best)
     return finest, best
+
+
+def _as_told(problem: Problem, level: Level) -> Level:
+    """A level that is drawn as the target says: its render leaves nothing open of n_d."""
+    if problem.tolerance is None:
+        return level
+    return level._replace(rendering=Rendered(problem.tolerance, 0.0, 0))
 
 
 def _clean(level: Level, lin: Linearised) -> bool:
@@ -2043,8 +2236,10 @@ def _drawn_level(
     drawing = Drawing(target.samples or FIRST_DRAWN, depth, seed, apart=not own)
     level = along._replace(drawing=drawing)
     if own:
-        return level, along, coarse
+        return _as_told(problem, level), along, coarse
     few = _descend(problem, level._replace(name=FEW), coarse.at, CUTOFF, 20, 1.0, along)
+    if problem.tolerance is not None:
+        return _drawn_within(problem, level, few), along, few
     drawn = _own_noise(problem, level, few.lin, few.at) if few.lin.seen else 0.0
     rest = np.sqrt(max(few.lin.noise**2 - drawn**2, 0.0))
     return _drawn_enough(problem, level, drawn, rest)[0], along, few
@@ -2217,6 +2412,7 @@ def _result(
         summary=known.summary
         + _clipped_words(clipped, problem.ceiling)
         + _outlier_words(outliers)
+        + (_rendering_words(level.rendering, known.samples[-1], known.n_d_std) if converged else "")
         + (UNFINISHED if stopped else ""),
         rms_residual=lin.rms,
         nearest_glasses=tuple((name, distance) for name, distance, _ in named[:5]),
@@ -2232,6 +2428,7 @@ def _result(
         probabilities=tuple(probability for _, _, probability in named[:5]),
         other_probability=other,
         stopped=stopped,
+        rendering=level.rendering,
     )
 
 
@@ -2389,20 +2586,15 @@ def _covariance(
         nearly singular is squared.
     """
     left, p = lin.eliminated(), lin.columns.others
-    index = unknowns.coefficients.index(z, unknowns.reference)
-    slope = _along_logs(unknowns.coefficients, lambda z: unknowns.change(z, index), z)
-    rows = np.concatenate([left.r @ slope / noise, unknowns.prior_rows], axis=0)
-    basis, scales, right = np.linalg.svd(rows, full_matrices=True)
-    count, m = len(scales), len(left.r)
+    slope, scales, right, logs = _answer(unknowns, z, left, noise)
+    count, m, rows = len(scales), len(left.r), logs.shape[1]
     # What comes in: for the others, for the index in units of the noise, and from the prior.
     unit = np.concatenate([np.ones(p), np.full(m, 1 / noise)])
-    within = np.eye(p + len(rows))
+    within = np.eye(p + rows)
     within[: p + m, : p + m] = meat * unit * unit[:, None]
-    gain = scales / (scales**2 + WIDEST**-2)
-    logs = right[:count].T @ (gain[:, None] * basis[:, :count].T)
     # The others follow the index.
     follow = -np.linalg.solve(left.own, left.mixed @ slope)
-    whole = np.zeros((p + len(z), p + len(rows)))
+    whole = np.zeros((p + len(z), p + rows))
     whole[p:, p:] = logs
     whole[:p, p:] = follow @ logs
     whole[:p, :p] = np.linalg.inv(left.own)
@@ -2411,6 +2603,33 @@ def _covariance(
     rest[:count] = (1 / (1 + (scales * WIDEST) ** 2)) * WIDEST**2 / (1 + (scales * WIDEST) ** 2)
     spread = np.concatenate([follow, np.eye(len(z))]) @ right.T
     return whole @ within @ whole.T + (spread * rest) @ spread.T
+
+
+class Answer(NamedTuple):
+    """How log |B| and log C follow what a picture says of the index.
+
+    Args:
+        slope: (m, free) of the index's coordinates along them.
+        scales: (k,) singular values of what the picture and a prior say of them.
+        right: (free, free) the directions these belong to, the first k rows.
+        logs: (free, m + prior's rows) how they follow the index's part of q in units of the noise,
+            and the prior's rows; with the sign of q.
+    """
+
+    slope: np.ndarray
+    scales: np.ndarray
+    right: np.ndarray
+    logs: np.ndarray
+
+
+def _answer(unknowns: Unknowns, z: Array, left: Eliminated, noise: float) -> Answer:
+    """How the coefficients follow q."""
+    index = unknowns.coefficients.index(z, unknowns.reference)
+    slope = _along_logs(unknowns.coefficients, lambda z: unknowns.change(z, index), z)
+    rows = np.concatenate([left.r @ slope / noise, unknowns.prior_rows], axis=0)
+    basis, scales, right = np.linalg.svd(rows, full_matrices=True)
+    gain, count = scales / (scales**2 + WIDEST**-2), len(scales)
+    return Answer(slope, scales, right, right[:count].T @ (gain[:, None] * basis[:, :count].T))
 
 
 def _along_logs(coefficients: Coefficients, of: Callable[[Any], Array], z: Array) -> np.ndarray:
@@ -2579,3 +2798,27 @@ def _outlier_words(count: int) -> str:
         return ""
     values = "1 value of the target is an outlier" if count == 1 else f"{count} values are outliers"
     return f" {values}, and left out by the robust loss."
+
+
+def _rendering_words(rendering: Rendered | None, most: int, n_d_std: float) -> str:
+    """What the fit's own render leaves open of n_d, where a tolerance was asked for.
+
+    Args:
+        rendering: what a converged fit chose.
+        most: samples of a pixel.
+        n_d_std: the error reported of n_d.
+    """
+    if rendering is None:
+        return ""
+    tolerance = f"the tolerance of {rendering.tolerance:g}"
+    text = f" The fit's own rendering leaves n_d open by an estimated {rendering.error:.1e}"
+    if not rendering.met:
+        return f"{text} with the most samples allowed, {most} a pixel: {tolerance} is not met."
+    if rendering.error == 0:
+        text = " The fit drew the picture as the target says: its rendering leaves nothing open"
+    if n_d_std > rendering.tolerance:
+        text += (
+            f". The picture fixes n_d to ±{n_d_std:.1e}: {tolerance} is met by the fit's own"
+            " rendering, not by the picture"
+        )
+    return f"{text}."

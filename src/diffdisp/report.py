@@ -18,7 +18,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocat
 
 from diffdisp.color import encode_srgb
 from diffdisp.dispersion import Sellmeier
-from diffdisp.fitting import FitResult, Resampled, Uncertainty
+from diffdisp.fitting import FitResult, Rendered, Resampled, Uncertainty
 from diffdisp.glasses import named_glass
 from diffdisp.image import Picture, linear_rgb, replacing
 from diffdisp.measuring import Measured, Setting, Tradeoff
@@ -70,7 +70,8 @@ def fit_json(result: FitResult) -> dict[str, Any]:
         },
         "nearest_glasses": list(_nearest_entries(result)),
         "other_glass_probability": _plain(result.other_probability),
-        "check": None if result.check is None else _plain_check(result.check),
+        "check": None if result.check is None else _plain_tuple(result.check),
+        "rendering": None if result.rendering is None else _plain_rendering(result),
     }
 
 
@@ -101,8 +102,14 @@ def _known_json(known: FitResult | Uncertainty) -> dict[str, Any]:
     }
 
 
-def _plain_check(check: Resampled) -> dict[str, Any]:
-    return {name: _plain(value) for name, value in check._asdict().items()}
+def _plain_tuple(told: Resampled | Rendered) -> dict[str, Any]:
+    return {name: _plain(value) for name, value in told._asdict().items()}
+
+
+def _plain_rendering(result: FitResult) -> dict[str, Any]:
+    """What was chosen for a tolerance, and what it leaves open."""
+    assert result.rendering is not None
+    return {**_plain_tuple(result.rendering), "samples": list(result.samples)}
 
 
 def _nearest_entries(result: FitResult) -> Iterator[dict[str, Any]]:
@@ -154,6 +161,7 @@ def result_table(result: FitResult) -> str:
         *([("glass", _probable(result))] if result.probabilities else []),
         ("residual", f"{result.rms_residual:.3g} rms"),
         *([("check", _checked(result.check))] if result.check else []),
+        *([("rendering", rendering_words(result))] if result.rendering else []),
         *([("left out", f"{_count(result.masked, 'pixel')} by the mask")] if result.masked else []),
     ]
     return _table(rows, result)
@@ -232,6 +240,22 @@ def _checked(check: Resampled) -> str:
     """What resampling found."""
     margin = check.ratio / math.sqrt(2 * (check.repeats - 1))
     return f"resampled n_d spreads {check.ratio:.2f} ± {margin:.2f} times its error"
+
+
+def rendering_words(result: FitResult) -> str:
+    """What a fit to a tolerance chose for its own render, and what that leaves open of n_d.
+
+    Args:
+        result: of `fit` with a tolerance.
+    """
+    assert result.rendering is not None
+    fewest, most = result.samples[0], result.samples[-1]
+    samples = f"{fewest}" if fewest == most else f"{fewest} to {most}"
+    return (
+        f"n_d to an estimated {result.rendering.error:.1e} by {samples} samples a pixel,"
+        f" {_count(result.rendering.refinements, 'refinement')}; tolerance"
+        f" {result.rendering.tolerance:g}"
+    )
 
 
 def _probable(result: FitResult) -> str:
