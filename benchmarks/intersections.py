@@ -1,20 +1,20 @@
 """Where float32 puts the point at which a ray meets a sphere, against float64 on the same rays.
 
-Two forms: the one of the tracer, whose discriminant is that of the foot of the perpendicular, and
-the quadratic of textbooks, b² - c. Small spheres far away and large spheres close by are what each
-of them is bad at.
+Three forms: the one of the tracer, whose discriminant is that of the foot of the perpendicular; the
+one that it takes where spheres are very large; and the quadratic of textbooks, b² - c. Small
+spheres far away and large spheres close by are what they are bad at.
 """
 
 import argparse
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from record import print_table, write_record
 
-from diffdisp.geometry import Ray, first_distance
+from diffdisp.geometry import Ray, fine_first_distance, first_distance
 from diffdisp.vector import Vec3
 
 BESIDE = 1e-4
@@ -22,10 +22,11 @@ BESIDE = 1e-4
 
 
 class Rays(NamedTuple):
-    """Rays (n, 3), as float32 holds them, to a sphere about the origin."""
+    """Rays (n, 3), as float32 holds them, to a sphere."""
 
     origins: np.ndarray
     directions: np.ndarray
+    center: np.ndarray
     radius: float
 
 
@@ -37,17 +38,17 @@ def towards_far(distance: float, count: int, generator: np.random.Generator) -> 
     across, up = _across(out)
     targets = impact[:, None] * (np.cos(turn)[:, None] * across + np.sin(turn)[:, None] * up)
     origins = (distance * out).astype(np.float32)
-    return Rays(origins, _unit(targets - origins).astype(np.float32), 1.0)
+    return Rays(origins, _unit(targets - origins).astype(np.float32), np.zeros(3), 1.0)
 
 
 def onto_ground(radius: float, count: int, generator: np.random.Generator) -> Rays:
-    """Rays from 1 above a large sphere, down to a cosine of 0.01 with it."""
-    out = _unit(generator.normal(size=(count, 3)))
+    """Rays from about 1 above a large sphere beneath, down to a cosine of 0.01 with it."""
     turn, cosine = generator.uniform(0, 2 * np.pi, count), generator.uniform(0.01, 1, count)
-    across, up = _across(out)
-    level = np.cos(turn)[:, None] * across + np.sin(turn)[:, None] * up
-    directions = level * np.sqrt(1 - cosine**2)[:, None] - out * cosine[:, None]
-    return Rays(((radius + 1) * out).astype(np.float32), directions.astype(np.float32), radius)
+    sine = np.sqrt(1 - cosine**2)
+    directions = np.stack([np.cos(turn) * sine, -cosine, np.sin(turn) * sine], axis=-1)
+    origins = generator.uniform(-0.3, 0.3, (count, 3)) + np.array([0.0, 1.0, 0.0])
+    center = np.array([0.0, -radius, 0.0])
+    return Rays(origins.astype(np.float32), directions.astype(np.float32), center, radius)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
@@ -63,7 +64,7 @@ def _across(out: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def exact(rays: Rays) -> tuple[np.ndarray, np.ndarray]:
     """Distance (n,) to the first point, NaN without one, and from the silhouette, in radii."""
-    origins, directions = rays.origins.astype(np.float64), rays.directions.astype(np.float64)
+    origins, directions = rays.origins - rays.center, rays.directions.astype(np.float64)
     squared = np.sum(directions**2, axis=-1)
     along = -np.sum(origins * directions, axis=-1) / squared
     foot = origins + directions * along[:, None]
@@ -78,23 +79,32 @@ def exact(rays: Rays) -> tuple[np.ndarray, np.ndarray]:
 
 def by_tracer(rays: Rays) -> tuple[np.ndarray, np.ndarray]:
     """Distance in float32, and whether the sphere is met, by the tracer's form."""
-    ray = Ray(_vector(rays.origins), _vector(rays.directions))
-    zero = jnp.zeros(len(rays.origins), jnp.float32)
-    center, square = Vec3(zero, zero, zero), zero + np.float32(rays.radius) ** 2
-    distance, meets = jax.jit(first_distance)(ray, center, square, zero > 0)
-    return np.asarray(distance), np.asarray(meets)
+    return _met(lambda ray, c, r: first_distance(ray, c, r * r, r < 0), rays)
+
+
+def by_fine(rays: Rays) -> tuple[np.ndarray, np.ndarray]:
+    """The same by the form for scenes with very large spheres."""
+    return _met(lambda ray, c, r: fine_first_distance(ray, c, r, r < 0), rays)
 
 
 def by_quadratic(rays: Rays) -> tuple[np.ndarray, np.ndarray]:
     """The same by b - √(b² - c)."""
 
-    @jax.jit
-    def met(origin: Vec3, direction: Vec3) -> tuple[jax.Array, jax.Array]:
-        b = -origin.dot(direction)
-        discriminant = b * b - (origin.dot(origin) - np.float32(rays.radius) ** 2)
+    def of(ray: Ray, center: Vec3, radius: jax.Array) -> tuple[jax.Array, jax.Array]:
+        origin = ray.origin - center
+        b = -origin.dot(ray.direction)
+        discriminant = b * b - (origin.dot(origin) - radius * radius)
         return b - jnp.sqrt(jnp.maximum(discriminant, 0)), discriminant > 0
 
-    distance, meets = met(_vector(rays.origins), _vector(rays.directions))
+    return _met(of, rays)
+
+
+def _met(of: Callable[..., Any], rays: Rays) -> tuple[np.ndarray, np.ndarray]:
+    """What a form tells of a ray, its sphere's centre and radius, of all rays."""
+    alike = jnp.zeros(len(rays.origins), jnp.float32)
+    center = Vec3(*(alike + np.float32(x) for x in rays.center))
+    ray = Ray(_vector(rays.origins), _vector(rays.directions))
+    distance, meets = jax.jit(of)(ray, center, alike + np.float32(rays.radius))
     return np.asarray(distance), np.asarray(meets)
 
 
@@ -104,6 +114,7 @@ def _vector(array: np.ndarray) -> Vec3:
 
 FORMS: dict[str, Callable[[Rays], tuple[np.ndarray, np.ndarray]]] = {
     "tracer": by_tracer,
+    "fine": by_fine,
     "quadratic": by_quadratic,
 }
 SCENES: dict[str, tuple[Callable[[float, int, np.random.Generator], Rays], tuple[float, ...]]] = {

@@ -19,6 +19,8 @@ from helpers import (
     glass_of_index,
     incidence_on_unit_ball,
     lamp,
+    matte,
+    metal,
     reflectance,
 )
 
@@ -640,6 +642,19 @@ def test_a_thousand_bands_are_each_their_own(dtype):
         R = ((n[some] - 1) / (n[some] + 1)) ** 2
         tolerance = {"float32": 1e-6, "float64": 1e-12}[dtype]
         np.testing.assert_allclose(picture[0, 0], 1 - (1 - R) * R, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("radius", [1e1, 1e3, 1e5])
+def test_a_tiny_ball_on_a_very_large_one_is_the_same_in_float32(radius):
+    ground = Object(Sphere([0, -radius, 0], radius), Lambertian([0.5] * 3))
+    balls = matte(0.8, (0, 1e-3, 0), 1e-3), metal(0.9, (2.5e-3, 1e-3, 0), 1e-3)
+    view = Camera([0, 2e-3, 8e-3], [0, 1e-3, 0], vertical_fov=40.0)
+    scene = Scene(view, (ground, *balls), Background(WHITE))
+    single, double = (
+        render(scene, Film(24, 24), samples=16, depth=6, dtype=dtype)
+        for dtype in ("float32", "float64")
+    )
+    np.testing.assert_allclose(single, double, rtol=0, atol=1e-5)
 
 
 @TYPES

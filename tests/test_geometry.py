@@ -6,6 +6,7 @@ from helpers import numbers
 
 from diffdisp.geometry import (
     Ray,
+    fine_first_distance,
     first_distance,
     mean_root,
     plane_axes,
@@ -267,6 +268,79 @@ def test_first_point_of_a_far_small_sphere_in_float32():
     np.testing.assert_array_equal(meets[clear], hit[clear])
     sure = clear & hit
     np.testing.assert_allclose(found[sure], near[sure], rtol=4e-7)
+
+
+def fine(origins, directions, center, radius, on=False):
+    """`fine_first_distance` of many rays (N, 3), in float32."""
+    with jax.enable_x64(False):
+        origins, directions, center, radius = (
+            jnp.asarray(v, jnp.float32) for v in (origins, directions, center, radius)
+        )
+        rays = Ray(Vec3(*origins.T), Vec3(*directions.T))
+        one = jax.vmap(lambda r: fine_first_distance(r, vec3(center), radius, jnp.asarray(on)))
+        return [np.asarray(part) for part in jax.jit(one)(rays)]
+
+
+@pytest.mark.parametrize("radius", [1.0, 1e3, 1e5, 1e6])
+def test_fine_distance_to_a_ground_however_large(radius):
+    # A million rays from about 1 above it, down to a cosine of 0.01.
+    count = 1_000_000
+    turn, cosine = RNG.uniform(0, 2 * np.pi, count), RNG.uniform(0.01, 1, count)
+    sine = np.sqrt(1 - cosine**2)
+    directions = np.stack([np.cos(turn) * sine, -cosine, np.sin(turn) * sine], -1)
+    directions = directions.astype(np.float32)
+    origins = (RNG.uniform(-0.3, 0.3, (count, 3)) + np.array([0, 1, 0])).astype(np.float32)
+    center = np.array([0, -radius, 0])
+    found, meets = fine(origins, directions, center, radius)
+    near, _, hit = truth(origins, directions, center, radius)
+    passed = np.linalg.norm(np.cross(origins - center, directions.astype(float)), axis=-1)
+    clear = np.abs(passed / radius - 1) > 1e-4
+    np.testing.assert_array_equal(meets[clear], hit[clear])
+    sure = meets & hit & clear
+    assert sure.sum() > count / 10
+    np.testing.assert_allclose(found[sure], near[sure], rtol=1e-5)
+
+
+@pytest.mark.parametrize("scale", [0.3, 0.99, 1.01, 2.0, 30.0, 1e4])
+def test_fine_distance_is_the_least_positive_root(scale):
+    center = np.array([0.3, -0.2, 0.1])
+    origins = (center + scale * unit(RNG.normal(size=(5000, 3)))).astype(np.float32)
+    targets = center + RNG.uniform(-1.2, 1.2, size=(5000, 3))
+    directions = unit(targets - origins).astype(np.float32)
+    found, meets = fine(origins, directions, center.astype(np.float32), 1.0)
+    near, far, hit = truth(origins, directions, center.astype(np.float32), 1.0)
+    expected = np.where(near > 0, near, far)
+    passed = np.linalg.norm(
+        np.cross(origins - center.astype(np.float32), directions.astype(float)), axis=-1
+    )
+    clear = np.abs(passed - 1) > 1e-3
+    np.testing.assert_array_equal(meets[clear], (hit & (expected > 0))[clear])
+    sure = clear & meets
+    np.testing.assert_allclose(found[sure], expected[sure], rtol=1e-5)
+
+
+def test_fine_distance_from_a_sphere_is_its_chord():
+    out, inward = unit(RNG.normal(size=(500, 3))), unit(RNG.normal(size=(500, 3)))
+    inward = np.where((inward * out).sum(-1, keepdims=True) < 0, inward, -inward)
+    chord = -2 * 1e5 * (inward * out).sum(-1)
+    found, meets = fine(1e5 * out, inward, np.zeros(3), 1e5, on=True)
+    assert meets.all()
+    np.testing.assert_allclose(found, chord, rtol=1e-4, atol=1.0)
+    _, meets = fine(1e5 * out, -inward, np.zeros(3), 1e5, on=True)
+    assert not meets.any()
+
+
+def test_derivatives_of_a_fine_distance():
+    center, radius = vec3(jnp.array([0.2, 0.1, -0.3], jnp.float32)), jnp.float32(0.8)
+    start = Ray(
+        vec3(jnp.array([0.1, 0.3, 3.0], jnp.float32)), vec3(jnp.array([0, 0, -1], jnp.float32))
+    )
+    on = jnp.asarray(False)
+    of = start, center, radius
+    change = jax.tree.map(lambda leaf: leaf * 0 + jnp.float32(0.3), of)
+    _, slope = jax.jvp(lambda ray, c, r: fine_first_distance(ray, c, r, on)[0], of, change)
+    _, expected = jax.jvp(lambda ray, c, r: first_distance(ray, c, r * r, on)[0], of, change)
+    np.testing.assert_allclose(slope, expected, rtol=1e-5)
 
 
 def first_of(x, z, radius, on):

@@ -24,6 +24,7 @@ from diffdisp.geometry import (
     Ray,
     Sphere,
     box_width,
+    fine_first_distance,
     first_distance,
     plane_axes,
     plane_distance,
@@ -372,7 +373,10 @@ def nearest(
         for row in range(spheres.group):
             place = group * spheres.group + row
             center, number = _pick_vector(centers, place), number_at(place)
-            distance, meets = first_distance(ray, center, squares[place], number == last)
+            if plan.fine:
+                distance, meets = fine_first_distance(ray, center, radii[place], number == last)
+            else:
+                distance, meets = first_distance(ray, center, squares[place], number == last)
             if reach is not None:
                 along, depth, edges = sphere_depth(ray, reach, center, radii[place])
                 grazes = (depth <= 0) & (depth + 0.5 * box_width(edges) > 0) & (along > 0)
@@ -2079,7 +2083,11 @@ def _meet(path: Path, setting: Setting) -> tuple[Vec3, Vec3, Real]:
     def to_sphere() -> tuple[Vec3, Real, Real]:
         row = jnp.minimum(surface, rows - 1)
         center, radius = _pick_vector(world.centers, row), _pick(world.radii, row)
-        distance, _ = first_distance(ray, center, radius * radius, path.last == surface)
+        begins = path.last == surface
+        if plan.fine:
+            distance, _ = fine_first_distance(ray, center, radius, begins)
+        else:
+            distance, _ = first_distance(ray, center, radius * radius, begins)
         return center, radius, distance
 
     sphere = once(to_sphere, setting.one) if rows else None
@@ -2102,9 +2110,12 @@ def _meet(path: Path, setting: Setting) -> tuple[Vec3, Vec3, Real]:
     def meeting() -> tuple[Vec3, Vec3, Real]:
         if sphere is not None:
             center, radius, distance = sphere
-            outward = normalize(ray.origin + ray.direction * distance - center)
-            # Back onto the sphere: in float32 the ray ends some way off a large one.
-            point = center + outward * radius
+            point = ray.origin + ray.direction * distance
+            outward = normalize(point - center)
+            # Back onto the sphere: in float32 the ray ends some way off a large one. By a fine
+            # distance it does not, and so near it is nearer to the sphere than numbers from there.
+            back = center + outward * radius
+            point = choose(distance < radius, point, back) if plan.fine else back
             if outline is not None:
                 is_soft, offset = outline
                 soft = center + offset, normalize(offset)

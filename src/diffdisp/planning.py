@@ -46,6 +46,8 @@ class Plan:
         fuzzy: whether any metal is not smooth.
         nested: whether anything, the camera too, may lie within or across a glass ball.
         soft: whether a ball's outline is averaged over footprints, as what moves it asks for.
+        fine: whether a sphere is so large beside what is near it that float32 has to take its
+            distances with more digits than its own.
         filtered: whether what a path meets before anything scatters it is averaged over its
             footprint although paths scatter, as derivatives ask for.
     """
@@ -66,6 +68,7 @@ class Plan:
     cubed: tuple[bool, bool]
     fuzzy: bool
     nested: bool
+    fine: bool = False
     soft: bool = False
     filtered: bool = False
 
@@ -174,7 +177,7 @@ class Plan:
             "objects": ", ".join(f"{n} {kind}" for kind, n in counts.items() if n) or "none",
             "samples": f"{self.samples} a pixel, {columns} x {rows} grid",
             "depth": f"{self.depth} segments" if bouncing else "1: nothing sends light on",
-            "dtype": self.dtype,
+            "dtype": f"{self.dtype}{', distances with more digits' if self.fine else ''}",
             "spectrum": spectrum,
             "checker": f"{' and '.join(shown)}, {checker}" if shown else "not compiled",
             "media": "nested or overlapping" if self.nested else "separate balls",
@@ -215,7 +218,27 @@ def make_plan(scene: Scene, film: Film, samples: int, depth: int, dtype: str) ->
         cubed=_carried(scene, Checker),
         fuzzy=any(_fuzzy(obj.material) for obj in scene.objects),
         nested=_nested(scene, balls),
+        fine=dtype == "float32" and _large(scene),
     )
+
+
+LARGE = 1e3
+"""Radius of a sphere over that of another, or over the camera's distance from it, from which on it
+is large: from 1 above one of 1e3 float32 is 2e-5 off in distances, at worst 1.4e-4, and ten times
+that for each ten times its radius. More digits take a sixth more time where there are 16 spheres,
+so that they are for scenes that need them."""
+
+
+def _large(scene: Scene) -> bool:
+    """Whether a sphere is very much larger than another, or than the camera is away from it."""
+    spheres = [obj.shape for obj in scene.objects if isinstance(obj.shape, Sphere)]
+    if not spheres or not _known(scene.camera.look_from, *jax.tree.leaves(spheres)):
+        return False
+    radii = np.array([float(np.asarray(sphere.radius)) for sphere in spheres])
+    centers = np.stack([np.asarray(sphere.center, np.float64) for sphere in spheres])
+    apart = np.linalg.norm(centers - np.asarray(scene.camera.look_from, np.float64), axis=-1)
+    least = np.minimum(radii.min(), np.abs(apart - radii))
+    return bool(np.any(radii > LARGE * least))
 
 
 def _known(*leaves: object) -> bool:
