@@ -31,6 +31,7 @@ from diffdisp import (
     Picture,
     Scene,
     Sphere,
+    Uncertainty,
     band_middles,
     fit,
     load_scene,
@@ -96,7 +97,20 @@ def displaced(scene: Scene) -> Scene:
     return Scene(scene.camera, (Object(shape, ball.material, "ball"), *others), scene.background)
 
 
-def scores(result: FitResult) -> dict[str, list[float]]:
+def true_scene(case: Case) -> Scene:
+    """What the pictures of a case show."""
+    shown = with_glass(case.start(), 0, named_glass(TARGET_GLASS))
+    return displaced(shown) if "ball.center" in case.free else shown
+
+
+def clean_picture(case: Case, film: Film) -> np.ndarray:
+    """The picture before noise."""
+    picture = render(true_scene(case), film, samples=case.samples, dtype="float64")
+    clean = np.asarray(picture) * (TRUE["gain"] if "gain" in case.free else 1.0)
+    return clean + (TRUE["black"] if "black" in case.free else 0.0)
+
+
+def scores(result: FitResult | Uncertainty) -> dict[str, list[float]]:
     """Deviations from the truth over the reported standard deviations."""
     with jax.enable_x64(True):
         glass = named_glass(TARGET_GLASS)
@@ -158,11 +172,7 @@ def calibrate(
         repeats: how many fits there are to be.
         before: rows of those that there are.
     """
-    shown = with_glass(case.start(), 0, named_glass(TARGET_GLASS))
-    shown = displaced(shown) if "ball.center" in case.free else shown
-    picture = render(shown, film, samples=case.samples, dtype="float64")
-    clean = np.asarray(picture) * (TRUE["gain"] if "gain" in case.free else 1.0)
-    clean += TRUE["black"] if "black" in case.free else 0.0
+    clean = clean_picture(case, film)
     found: dict[str, list[float]] = {"n_d": [], "V_d": [], "n": [], "free": []}
     found |= {row["of"]: list(row["z"]) for row in before}
     failed = before[0]["failed"] if before else 0
