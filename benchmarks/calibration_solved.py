@@ -2,8 +2,8 @@
 
 A fit with places free takes a minute or more, so `calibration` has 200 of each kind, too few to
 tell a wrong error bar from the luck of their draws. Here the picture is traced once, at the truth,
-and taken for linear about it. A draw of noise then takes half a second: the
-fit's own solve finds the Sellmeier sum, from the fit's start, and its own formula the errors.
+and taken for linear about it. A draw of noise then takes half a second: the fit's own solve finds
+the Sellmeier sum, from the fit's start, and its own formula the errors.
 
 So this has the noise, the weights of pixels, what else is free, and all that Sellmeier sums make of
 it. It does not have that the picture is not linear: the way through the fit's levels, the mean
