@@ -434,8 +434,10 @@ def main() -> None:
     head = ("samples", "outline: to hard edges", "noise of those")
     print_table(head, [list(row.values()) for row in figures["outline"]])
     print()
-    head = ("where paths scatter", "samples", "to hard edges", "worst", "warm s", "first s")
-    print_table(head, [list(row.values())[: len(head)] for row in figures["scattered"]])
+    # Rows that are kept may lack what later ones have.
+    told = ("scene", "samples", "from_hard_edges", "worst", "warm_s", "first_s")
+    head = [name for name in told if name in figures["scattered"][0]]
+    print_table(head, [[row[name] for name in head] for row in figures["scattered"]])
     settings = {name: value for name, value in vars(options).items() if name != "only"}
     write_record("derivative", settings, figures)
 

@@ -163,6 +163,24 @@ def test_of_traced_numbers_the_general_case_is_assumed():
     assert plans[0].fuzzy
 
 
+@pytest.mark.parametrize(
+    ("radius", "height", "dtype", "fine"),
+    [
+        (999.0, 1.0, "float32", False),  # beside a ball of 1
+        (1001.0, 1.0, "float32", True),
+        (1001.0, 1.0, "float64", False),
+        (500.0, 0.6, "float32", False),  # to a camera so far above it
+        (500.0, 0.4, "float32", True),
+    ],
+)
+def test_very_large_spheres_take_more_digits(radius, height, dtype, fine):
+    objects = ball(1.5, (9, 9, 0)), matte(0.5, (0, -radius, 0), radius)
+    scene = furnace(*objects, look_from=(0, height, 0))
+    plan = make_plan(scene, COLOR, 4, 10, dtype)
+    assert plan.fine == fine
+    assert ("distances with more digits" in str(plan)) == fine
+
+
 def test_equal_plans_are_one_program():
     assert plan_of(ball("N-BK7")) == plan_of(ball("N-SF11", (0.1, 0, 0), 1.1))
     assert hash(plan_of(ball("N-BK7"))) == hash(plan_of(ball("N-SF11")))

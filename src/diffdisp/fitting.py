@@ -1707,9 +1707,7 @@ def _more_samples(
         rows, told = rows[further], told[further]
         error[rows] *= (fewer / more) ** 2
         if len(rows) and more < splits[-1]:
-            part = _part(problem, 1, FEW_SAMPLES, depth, level.blocks[rows], rows, more)
-            traced = _trace(problem, part, at, level.seed, CUTOFF, False, False)
-            finer = traced[:, 0] * gains + black
+            finer = _split(problem, level, at, depth, rows, more)
             told = np.max(np.abs(finer - picture[rows]), axis=1)
             picture[rows], error[rows] = finer, told / 3
             along = rows[outlined[rows]]
@@ -1763,7 +1761,6 @@ def _samples_within(
         moves = np.any(some.columns.values[:, :, :of_scene], axis=(0, 2))
         crossed = _crossed(_with_others(problem, at.others), problem.film)
         outlined = _outlined(problem, level, some.weight.any(axis=1) | moves, crossed)
-    gains, black = problem.free.exposure(at.others)
     picture, change = some.picture.copy(), some.picture - few.picture
     splits, refinements = np.full(len(picture), SPLITS[0]), 0
     while True:
@@ -1779,18 +1776,17 @@ def _samples_within(
             chosen |= outlined & coarse
         for split in np.unique(splits[chosen]).tolist():
             rows = np.flatnonzero(chosen & (splits == split))
-            part = _part(problem, 1, FEW_SAMPLES, depth, level.blocks[rows], rows, 2 * split)
-            traced = _trace(problem, part, at, level.seed, CUTOFF, False, False)
-            finer = traced[:, 0] * gains + black
+            finer = _split(problem, level, at, depth, rows, 2 * split)
             change[rows], picture[rows] = finer - picture[rows], finer
         splits[chosen] *= 2
         refinements += 1
     level = level._replace(rendering=Rendered(tolerance, left, refinements))
 
     def drawn(splits: np.ndarray) -> Level:
-        each = [(np.flatnonzero(splits == split), split) for split in np.unique(splits).tolist()]
-        drawn = partial(_extrapolated, problem, level, depth)
-        parts = [part for rows, split in each for part in drawn(rows, (split // 2, split))]
+        parts: list[Part] = []
+        for split in np.unique(splits).tolist():
+            rows = np.flatnonzero(splits == split)
+            parts += _extrapolated(problem, level, depth, rows, (split // 2, split))
         return level._replace(parts=tuple(parts))
 
     return drawn(splits), drawn(np.minimum(splits, FOR_SLOPES) if of_scene else splits)
@@ -1820,6 +1816,17 @@ def _marked(off: Float[np.ndarray, " blocks"]) -> np.ndarray:
     marked = np.zeros(len(off), bool)
     marked[order[: np.searchsorted(held, MARKED * held[-1]) + 1]] = True
     return marked & (off != 0)
+
+
+def _split(
+    problem: Problem, level: Level, at: Point, depth: int, rows: np.ndarray, split: int
+) -> np.ndarray:
+    """The picture of some rows, (rows, channels), with a split, as the fit exposes it."""
+    part = _part(problem, 1, FEW_SAMPLES, depth, level.blocks[rows], rows, split)
+    traced = _trace(problem, part, at, level.seed, CUTOFF, False, False)
+    gains, black = problem.free.exposure(at.others)
+    picture: np.ndarray = traced[:, 0] * gains + black
+    return picture
 
 
 def _extrapolated(

@@ -107,8 +107,8 @@ def _first_ahead(b: Real, half: Real, product: Real, meets: Array) -> tuple[Real
 def fine_first_distance(ray: Ray, center: Vec3, radius: Real, on: Array) -> tuple[Real, Array]:
     """`first_distance` in float32 of spheres that are very large beside their distance, too.
 
-    Float32 has the square of such a sphere's radius to a thousandth of its height above it. Here
-    |o|² - r² is summed with what each of its steps rounds off.
+    There |o|² and r² are each rounded by more than is left of their difference. Here that is summed
+    with what each of its steps rounds off.
 
     Args:
         ray: the ray.

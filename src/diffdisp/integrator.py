@@ -373,10 +373,8 @@ def nearest(
         for row in range(spheres.group):
             place = group * spheres.group + row
             center, number = _pick_vector(centers, place), number_at(place)
-            if plan.fine:
-                distance, meets = fine_first_distance(ray, center, radii[place], number == last)
-            else:
-                distance, meets = first_distance(ray, center, squares[place], number == last)
+            sphere = center, radii[place], squares[place]
+            distance, meets = _sphere_ahead(ray, *sphere, number == last, plan)
             if reach is not None:
                 along, depth, edges = sphere_depth(ray, reach, center, radii[place])
                 grazes = (depth <= 0) & (depth + 0.5 * box_width(edges) > 0) & (along > 0)
@@ -425,6 +423,15 @@ def nearest(
         distance = jnp.where(closer, to_plane, distance)
         number = jnp.where(closer, plane, number)
     return number
+
+
+def _sphere_ahead(
+    ray: Ray, center: Vec3, radius: Real, squared: Real, on: Array, plan: Plan
+) -> tuple[Real, Array]:
+    """`first_distance`, with more digits where the scene asks for them."""
+    if plan.fine:
+        return fine_first_distance(ray, center, radius, on)
+    return first_distance(ray, center, squared, on)
 
 
 def surface_numbers(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
@@ -2078,16 +2085,12 @@ def _meet(path: Path, setting: Setting) -> tuple[Vec3, Vec3, Real]:
     The normal of a sphere is the outward one.
     """
     (world, *_), plan, ray, surface = setting.tables, setting.plan, path.ray, path.surface
-    rows = plan.first_plane
+    rows, begins = plan.first_plane, path.last == surface
 
     def to_sphere() -> tuple[Vec3, Real, Real]:
         row = jnp.minimum(surface, rows - 1)
         center, radius = _pick_vector(world.centers, row), _pick(world.radii, row)
-        begins = path.last == surface
-        if plan.fine:
-            distance, _ = fine_first_distance(ray, center, radius, begins)
-        else:
-            distance, _ = first_distance(ray, center, radius * radius, begins)
+        distance, _ = _sphere_ahead(ray, center, radius, radius * radius, begins, plan)
         return center, radius, distance
 
     sphere = once(to_sphere, setting.one) if rows else None
@@ -2097,7 +2100,6 @@ def _meet(path: Path, setting: Setting) -> tuple[Vec3, Vec3, Real]:
         assert sphere is not None
         assert path.footprint is not None
         center, radius, _ = sphere
-        begins = path.last == surface
         outside = _starts_outside(ray, center, radius)
         is_soft = (surface < plan.balls) & (begins | outside) & ~_all_zero(path.footprint)
         width = box_width(sphere_depth(ray, path.footprint, center, radius)[2])
