@@ -128,6 +128,26 @@ def incidence_on_unit_ball(film: Film, distance: float, vertical_fov: float) -> 
     return np.arcsin(np.where(impact < 1.0, impact, np.nan))
 
 
+def part_in_unit_ball(film: Film, distance: float, vertical_fov: float) -> np.ndarray:
+    """Part (height, width) of each pixel that sees the ball of `incidence_on_unit_ball`."""
+    return _in_unit_ball(film, 200, distance, vertical_fov).mean(axis=(1, 3))
+
+
+def whole_samples(film: Film, across: int, distance: float, vertical_fov: float) -> np.ndarray:
+    """Pixels (height, width) of which that ball's outline cuts no sample, of `across` squared."""
+    fine = Film(film.width * across, film.height * across)
+    seen = _in_unit_ball(fine, 100, distance, vertical_fov)
+    whole = seen.min(axis=(1, 3)) == seen.max(axis=(1, 3))
+    return whole.reshape(film.height, across, film.width, across).all(axis=(1, 3))
+
+
+def _in_unit_ball(film: Film, points: int, distance: float, vertical_fov: float) -> np.ndarray:
+    """Whether points (height, points, width, points) of a film see the ball."""
+    fine = Film(film.width * points, film.height * points)
+    seen = ~np.isnan(incidence_on_unit_ball(fine, distance, vertical_fov))
+    return seen.reshape(film.height, points, film.width, points)
+
+
 def deviation(incidence: float, n: float, order: int) -> float:
     """D_p = 2(i - r) + p(π - 2r): p = 0 is straight through, p = -1 the outer reflection."""
     refraction = np.arcsin(np.sin(incidence) / n)

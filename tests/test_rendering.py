@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -18,8 +16,10 @@ from helpers import (
     glass_of_index,
     incidence_on_unit_ball,
     lamp,
+    part_in_unit_ball,
     reflectance,
     screen,
+    whole_samples,
 )
 
 from diffdisp import chunks, integrator, rendering
@@ -28,7 +28,6 @@ from diffdisp.dispersion import Sellmeier
 from diffdisp.film import Film
 from diffdisp.geometry import Plane, Sphere
 from diffdisp.material import Dielectric, Emitter
-from diffdisp.planning import make_plan
 from diffdisp.rendering import render, render_progressively
 from diffdisp.scene import Background, Object, Scene, with_glass
 from diffdisp.texture import Checker2D
@@ -58,9 +57,10 @@ def test_white_furnace_is_its_truncated_sum(dtype, depth, tolerance):
     # A ray's 1e-16 of rounding is divided by cos i > 0.05 at the outermost of these pixels.
     picture = render(furnace(ball(BK7)), BANDS, samples=1, depth=depth, dtype=dtype)
     incidence = incidence_on_unit_ball(BANDS, 4.0, 34.0)
+    whole = whole_samples(BANDS, 1, 4.0, 34.0)
     for band, n in enumerate(BK7.indices(BANDS.wavelengths)):
-        expected = known_furnace(incidence, n, depth - 2)
-        np.testing.assert_allclose(picture[..., band], expected, rtol=0, atol=tolerance)
+        expected = known_furnace(incidence, n, depth - 2)[whole]
+        np.testing.assert_allclose(picture[whole, band], expected, rtol=0, atol=tolerance)
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-12), ("float32", 1e-5)])
@@ -83,20 +83,21 @@ def test_a_ball_of_index_one_hides_nothing():
     film = Film(12, 10, wavelengths=[0.55])
     scene = bench(AIR)
     behind = Scene(scene.camera, scene.objects[1:])
+    picture, plain = (render(s, film, samples=4, depth=3) for s in (scene, behind))
     # The footprint through the ball is the one beside it; rounding at a distance of 7.
-    picture = render(scene, film, samples=4, depth=3)
-    np.testing.assert_allclose(
-        picture, render(behind, film, samples=4, depth=3), rtol=0, atol=1e-12
-    )
+    whole = whole_samples(film, 2, 4.0, 34.0)
+    np.testing.assert_allclose(picture[whole], plain[whole], rtol=0, atol=1e-12)
+    # Two pieces of a footprint see the borders within it a little otherwise.
+    np.testing.assert_allclose(picture, plain, rtol=0, atol=0.03)
 
 
 def test_depth_of_one_shows_no_glass():
     picture = render(furnace(ball(BK7)), BANDS, samples=1, depth=1)
-    seen = ~np.isnan(incidence_on_unit_ball(BANDS, 4.0, 34.0))
-    expected = np.where(seen[..., None], 0.0, [1.0, 1.0])
-    np.testing.assert_allclose(
-        picture, expected, rtol=0, atol=1e-15
-    )  # the basis sums to 1 but for one bit
+    missed = 1 - part_in_unit_ball(BANDS, 4.0, 34.0)
+    for band in (0, 1):
+        # An outline counts as straight within a sample, here a pixel.
+        np.testing.assert_allclose(picture[..., band], missed, rtol=0, atol=1e-2)
+        assert abs(picture[..., band].mean() - missed.mean()) < 1e-3
 
 
 def test_a_lamp_within_a_ball_looks_larger_by_the_index():
@@ -233,7 +234,9 @@ def test_a_ball_within_a_ball_of_the_same_glass_is_invisible(n):
         picture = render(scene, BANDS, samples=4, depth=60)
         # Rounding at each surface, magnified by up to 1e4 near the critical edge of the ball.
         plain = render(bench(n), BANDS, samples=4, depth=60)
-        np.testing.assert_allclose(picture, plain, rtol=0, atol=1e-9)
+        # Of balls within each other no outline cuts a sample in two.
+        whole = whole_samples(BANDS, 2, 4.0, 34.0)
+        np.testing.assert_allclose(picture[whole], plain[whole], rtol=0, atol=1e-9)
 
 
 # --- colour, bands and the shape of the picture
@@ -464,32 +467,18 @@ def test_outlines_seen_through_a_ball_move_with_its_index():
     assert np.linalg.norm(slope - difference) < 0.05 * np.linalg.norm(difference)
 
 
-def test_soft_outlines_move_as_the_picture_does():
+def test_outlines_move_as_the_picture_does():
     film = Film(24, 24, wavelengths=[0.55])
+    aside = eqx.tree_at(lambda s: s.objects[0].shape.center, bench(), np.array([0.01, 0.02, 0]))
 
-    def swollen(by):
-        aside = eqx.tree_at(lambda s: s.objects[0].shape.center, bench(), np.array([0.01, 0.02, 0]))
-        return eqx.tree_at(lambda s: s.objects[0].shape.radius, aside, 1.0 + by)
+    def swollen(by, samples):
+        scene = eqx.tree_at(lambda s: s.objects[0].shape.radius, aside, 1.0 + by)
+        return render(scene, film, samples=samples, dtype="float64")
 
-    def moved(by, soft):
-        plan = replace(make_plan(bench(), film, 64, 50, "float64"), soft=soft)
-        parts = chunks.film_spectrum(film, plan, 0), chunks.film_size(film)
-        pixels, place = chunks.all_pixels(film, chunks.chunk_pixels(film, plan))
-        run = chunks.run_numbers(plan, 0)
-        return chunks.render_chunks(plan, swollen(by), *parts, pixels, run).reshape(-1)[place]
-
-    def sharp(by):
-        picture = render(swollen(np.array(by)), film, samples=1600, dtype="float64")
-        return picture.reshape(-1)
-
-    difference = (sharp(1e-3) - sharp(-1e-3)) / 2e-3
-    apart = []
-    for soft in (True, False):
-        push = jax.jit(lambda x, soft=soft: jax.jvp(lambda x: moved(x, soft), (x,), (x + 1,))[1])
-        found = push(jnp.zeros(()))
-        apart.append(np.linalg.norm(found - difference) / np.linalg.norm(difference))
+    difference = (swollen(np.array(1e-3), 1600) - swollen(np.array(-1e-3), 1600)) / 2e-3
+    _, slope = jax.jvp(lambda by: swollen(by, 64), (jnp.zeros(()),), (jnp.ones(()),))
     # On points next to the rim the ball turns away within less than a sample's footprint.
-    assert apart[0] < 0.75 * apart[1]
+    assert np.linalg.norm(slope - difference) < 0.12 * np.linalg.norm(difference)
 
 
 def scenes():

@@ -33,7 +33,7 @@ from diffdisp.geometry import (
     sphere_distances,
 )
 from diffdisp.material import Dielectric, Emitter, Lambertian, Material, Metal
-from diffdisp.outline import part_within
+from diffdisp.outline import Piece, part_within, sphere_pieces, whole_footprint
 from diffdisp.planning import Plan
 from diffdisp.sampling import Numbers, sharing, uniform_direction
 from diffdisp.scene import Object, Scene, is_glass, texture_of
@@ -334,6 +334,7 @@ def nearest(
     spheres: Candidates,
     footprint: tuple[Ray, Ray] | None = None,
     without: Array | None = None,
+    spread: Real | None = None,
 ) -> Array:
     """Number of the surface that a ray meets first.
 
@@ -346,9 +347,11 @@ def nearest(
         spheres: those that the ray can meet.
         footprint: of the ray; where outlines are soft, a part of it that meets one counts as all.
         without: number of a surface that is left out.
+        spread: what a cone around the ray widens by along a unit of its length; a ball that it may
+            meet counts.
     """
-    ray, world, centers, radii, footprint = jax.lax.stop_gradient(
-        (ray, world, spheres.centers, spheres.radii, footprint)
+    ray, world, centers, radii, footprint, spread = jax.lax.stop_gradient(
+        (ray, world, spheres.centers, spheres.radii, footprint, spread)
     )
     squares = radii * radii
     word = jnp.int64 if plan.dtype == "float64" else jnp.int32
@@ -380,6 +383,10 @@ def nearest(
                 grazes = (depth <= 0) & (depth + 0.5 * box_width(edges) > 0) & (along > 0)
                 outlined = jnp.where(number < plan.balls, plan.soft, plan.filtered)
                 grazes = grazes & outlined & (number != last)
+                distance, meets = jnp.where(grazes, along, distance), meets | grazes
+            if spread is not None:
+                grazes, along = _passes_by(ray, center, radii[place], spread)
+                grazes = grazes & ~meets & (number < plan.balls)
                 distance, meets = jnp.where(grazes, along, distance), meets | grazes
             if without is not None:
                 meets = meets & (number != without)
@@ -432,6 +439,22 @@ def _sphere_ahead(
     if plan.fine:
         return fine_first_distance(ray, center, radius, on)
     return first_distance(ray, center, squared, on)
+
+
+def _passes_by(ray: Ray, center: Vec3, radius: Real, spread: Real) -> tuple[Array, Real]:
+    """Whether a cone around a ray may meet a sphere ahead, and how far along the ray that is.
+
+    Args:
+        ray: the middle of the cone.
+        center: the sphere's.
+        radius: the sphere's.
+        spread: what the cone widens by along a unit of its length.
+    """
+    to_origin = ray.origin - center
+    along = -to_origin.dot(ray.direction)
+    foot, reach = to_origin + ray.direction * along, radius + spread * along
+    outside = to_origin.dot(to_origin) > radius * radius
+    return outside & (along > 0) & (foot.dot(foot) < reach * reach), along
 
 
 def surface_numbers(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
@@ -557,7 +580,7 @@ def _filtered_tiles(
         one: as in `once`.
     """
     values, reaches = _staged(one, coordinates, met, *edges)
-    swap = jnp.abs(bends[1]) > jnp.abs(bends[0])
+    swap = jnp.abs(bends[1]) > jnp.abs(bends[0]) + UNBENT
     (bend, aside), (along, beside) = choose(
         swap, (bends[::-1], reaches[::-1]), (bends, tuple(reaches))
     )
@@ -580,6 +603,11 @@ def _filtered_tiles(
 
 MOST_BENT = 2.0
 """At twice its own cosine along an edge a footprint reaches the horizon, where all is its mean."""
+
+
+UNBENT = 1e-3
+"""A difference of bends that says nothing: head on both are rounding, and a footprint that is no
+rectangle looks otherwise by the halves of its other edge. A picture has the square of it wrong."""
 
 
 def _bends(path: Path, normal: Vec3) -> tuple[Real, Real]:
@@ -882,17 +910,21 @@ def start_path(
             two surfaces.
     """
 
-    def through(x: Real, y: Real) -> Ray:
-        return camera_ray(projection, x, y)
+    def through(piece: Piece) -> tuple[Ray, tuple[Ray, Ray]]:
+        def at(x: Real, y: Real) -> Ray:
+            return camera_ray(projection, film_point[0] + x * cell[0], film_point[1] + y * cell[1])
 
-    zero = jnp.zeros_like(film_point[0])
-    if plan.scattering and not plan.filtered:
-        ray, footprint = through(*film_point), None
-    else:
-        ray, push = jax.linearize(through, *film_point)
-        footprint = (push(zero + cell[0], zero), push(zero, zero + cell[1]))
+        ray, push = jax.linearize(at, *piece.middle)
+        across, down = piece.edges
+        return ray, (push(*across), push(*down))
+
+    whole = whole_footprint(film_point[0])
+    ray, edges = through(whole)
+    footprint = None if plan.scattering and not plan.filtered else edges
     spheres = all_spheres(tables.world, plan, None)
-    last = no_surface(zero)
+    last = no_surface(film_point[0])
+    if plan.cut:
+        return _cut_at_outline(through, whole, projection, spheres, tables, plan, one)
     if choices is None:
         surface = nearest(ray, tables.world, plan, last, spheres, footprint)
     else:
@@ -900,12 +932,7 @@ def start_path(
         surface, share, choices = _one_of_seen(
             ray, footprint, last, choices, spheres, tables.world, plan
         )
-    path = new_path(ray, footprint, surface, plan)
-    if footprint is not None and any(plan.tiled):
-        # Off the middle of the picture a step of the film turns a ray the less.
-        ahead = ray.direction.dot(projection.forward)
-        turns = tuple(-edge.direction.dot(projection.forward) / ahead for edge in footprint)
-        path = path._replace(stretch=(turns[0], turns[1]))
+    path = _from_camera(ray, footprint, surface, projection, plan)
     ends = surface >= plan.first_lamp
     if choices is None:
         shown = arriving(surface, path, tables, plan, one)
@@ -916,6 +943,85 @@ def start_path(
     radiance = _against_chance(radiance, counts, path.throughput, share, tables, plan)
     throughput = tuple(t * share for t in path.throughput)
     return path._replace(throughput=throughput, radiance=radiance, choices=choices)
+
+
+def _from_camera(
+    ray: Ray,
+    footprint: tuple[Ray, Ray] | None,
+    surface: Array,
+    projection: Projection,
+    plan: Plan,
+) -> Path:
+    """A path that the camera sends to a surface, and what its footprint has for tiles."""
+    path = new_path(ray, footprint, surface, plan)
+    if footprint is None or not any(plan.tiled):
+        return path
+    # Off the middle of the picture a step of the film turns a ray the less.
+    ahead = ray.direction.dot(projection.forward)
+    across, down = (-edge.direction.dot(projection.forward) / ahead for edge in footprint)
+    return path._replace(stretch=(across, down))
+
+
+def _cut_at_outline(
+    through: Callable[[Piece], tuple[Ray, tuple[Ray, Ray]]],
+    whole: Piece,
+    projection: Projection,
+    spheres: Candidates,
+    tables: Tables,
+    plan: Plan,
+    one: Array | None,
+) -> Path:
+    """A path that goes on into a ball with what of its footprint lies within the ball's outline.
+
+    What lies beside the ball sees another surface; where that one ends paths it has been seen.
+    Where it is a ball, too, the larger piece counts as all.
+
+    Args:
+        through: from a piece of the footprint to its middle's ray and its edges.
+        whole: all of it.
+        projection: as in `start_path`.
+        spheres: all of the scene.
+        tables: the scene.
+        plan: its static choices.
+        one: as in `once`.
+    """
+    world, nowhere = tables.world, no_surface(whole.part)
+
+    def cut() -> tuple[Array, Piece, Piece]:
+        """The ball that the footprint meets, what of it does, and the rest."""
+        ray, footprint = through(whole)
+        across, down = (safe_sqrt(edge.direction.dot(edge.direction)) for edge in footprint)
+        spread = 0.5 * (across + down)
+        surface = nearest(ray, world, plan, nowhere, spheres, spread=spread)
+        ball, at_ball = jnp.minimum(surface, plan.balls - 1), surface < plan.balls
+        center, radius = _pick_vector(world.centers, ball), _pick(world.radii, ball)
+        along, inner, outer = sphere_pieces(ray, footprint, center, radius)
+        around = at_ball & ~_starts_outside(ray, center, radius)
+        misses = ~at_ball | (~around & (along <= 0))
+        nothing = whole._replace(part=jnp.zeros_like(whole.part))
+        inner = choose(around, whole, choose(misses, nothing, inner))
+        outer = choose(misses, whole, choose(around, nothing, outer))
+        return jnp.where(at_ball, surface, -1), inner, outer
+
+    surface, inner, outer = once(cut, one)
+    into, beside = (
+        _from_camera(*through(piece), nowhere, projection, plan) for piece in (inner, outer)
+    )
+    behind = nearest(beside.ray, world, plan, nowhere, spheres, without=surface)
+    ends = behind >= plan.first_lamp
+    several = ~ends & (outer.part > 0)
+    first = jnp.where(several, inner.part >= outer.part, inner.part > 0)
+    part = jnp.where(several, 1.0, inner.part)
+    shown = arriving(behind, beside, tables, plan, one, plan.balls == 1)
+    seen = jnp.where(ends, outer.part, 0.0)
+    alive = (first | several) & (plan.depth > 1)
+    path = choose(first, into, beside)
+    return path._replace(
+        surface=jnp.where(alive, jnp.where(first, surface, behind), 0),
+        throughput=(part,),
+        radiance=tuple(seen * channel for channel in shown),
+        alive=alive,
+    )
 
 
 def no_surface(like: Real) -> Array:
@@ -2426,17 +2532,22 @@ def _radiance(plan: Plan, indices: tuple[Array, ...], lanes: Lanes, loop: Loop) 
         first = np.arange(lanes.weights.shape[0])[:, None, None] == 0
         seen = tuple(jnp.where(first, channel, 0.0) for channel in paths.radiance)
         paths = paths._replace(radiance=seen)
-    met = jnp.any(paths.alive, axis=0)
-    radiance: Array = jnp.stack(paths.radiance, axis=-1)
+    shown: Array = jnp.stack(paths.radiance, axis=-1)
+    radiance: Array = jnp.zeros_like(shown)
     if plan.first_lamp:
+        if not plan.scattering:
+            paths = paths._replace(radiance=(jnp.zeros_like(shown[..., 0]),) * plan.channels)
         radiance = _to_the_end(plan, indices, lanes, tables, paths, loop)
-    if lanes.weights is None:
-        return jnp.mean(radiance, axis=1, keepdims=True)
-    alike = 1.0 / (lanes.weights.shape[0] * lanes.weights.shape[1])
-    if plan.scattering:  # a path has been weighted where it met glass, if it did
+    if plan.scattering:
+        if lanes.weights is None:
+            return jnp.mean(radiance, axis=1, keepdims=True)
+        # A path has been weighted where it met glass, if it did.
         return radiance * (1.0 / lanes.weights.shape[1])
-    weights = jnp.where(met[None, :, :, None], lanes.weights[:, :, None, :], alike)
-    return radiance * weights
+    if lanes.weights is None:
+        return jnp.mean(shown + radiance, axis=1, keepdims=True)
+    # What the camera sees at once counts alike, what comes through glass by its wavelength.
+    alike = 1.0 / (lanes.weights.shape[0] * lanes.weights.shape[1])
+    return shown * alike + radiance * lanes.weights[:, :, None, :]
 
 
 def _to_the_end(

@@ -114,6 +114,16 @@ class Plan:
         return self.first_lamp > self.balls
 
     @property
+    def cut(self) -> bool:
+        """Whether the camera's footprints are cut in two along the outlines of balls.
+
+        Paths that scatter are points at the camera, or choose one of both sides; soft outlines have
+        no other side; and of balls within or across each other an outline may be no border at all.
+        """
+        among_others = self.nested and self.balls > 1
+        return self.balls > 0 and not (self.scattering or self.soft or among_others)
+
+    @property
     def lit(self) -> bool:
         """Whether lamps are sampled directly: there are some, and something for them to light."""
         first, last = self.mattes
