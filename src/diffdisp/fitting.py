@@ -1161,9 +1161,12 @@ def _trace(
     scene = without_names(scene)
     tangents = part.tangents if along_index else part.tangents[:0]
 
-    # A ball's outline moves with it; slopes of points of it are far from a pixel's. Where no light
-    # scatters the camera's footprints are cut along it.
-    plan = replace(part.plan, soft=part.plan.scattering and bool(places))
+    # A ball's outline moves with it; slopes of points of it are far from a pixel's. Of one ball the
+    # camera's footprints are cut along it; others are seen through that. Of a picture that is drawn
+    # as the target was they are the true ones all the same.
+    among_others = part.plan.balls > 1 and not part.plan.nested
+    soft = part.plan.scattering or (part.split > 1 and among_others)
+    plan = replace(part.plan, soft=soft and bool(places))
 
     def trace(chunks: Pixels) -> np.ndarray:
         fixed = (scene, part.spectrum, size, chunks, run, index, tangents)

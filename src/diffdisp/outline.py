@@ -17,8 +17,7 @@ class Piece(NamedTuple):
     Args:
         part: of the whole, from 0 to 1.
         middle: of the piece, from that of the whole, in its edges.
-        edges: of a parallelogram that is spread as the piece is, in those of the whole. They hold
-            for all of it, and have no derivative.
+        edges: of a parallelogram that is spread as the piece is, in those of the whole.
     """
 
     part: Real
