@@ -37,6 +37,7 @@ ORDER = (
     "varying",
     "scene_file",
     "measuring",
+    "fit_measuring",
     "report",
     "__main__",
 )

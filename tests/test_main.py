@@ -22,9 +22,10 @@ from diffdisp import __main__ as command_line
 from diffdisp import fitting
 from diffdisp.__main__ import main
 from diffdisp.film import Film
+from diffdisp.fit_measuring import FitMeasured, FitSetting
 from diffdisp.fitting import Rendered
 from diffdisp.image import Picture, read_picture, write_picture
-from diffdisp.measuring import Setting
+from diffdisp.measuring import Setting, Tradeoff
 from diffdisp.rendering import Growing, render_progressively
 from diffdisp.scene_file import load_scene
 from diffdisp.tolerance import Estimated, render_to_tolerance
@@ -1066,6 +1067,24 @@ def test_tradeoff(lit, out, capsys, monkeypatch):
     assert len(rows) == 3
 
 
+def test_tradeoff_of_fits(scene, target, out, capsys, monkeypatch):
+    asked = {}
+
+    def measured(*_args, folder, **knobs):
+        asked.update(knobs)
+        settings = (FitSetting(1, 50), FitSetting(0, 50))
+        row = FitMeasured(1.5, 1e-5, 1e-4, 1e-4, 0.1, 1, 9.0, 1.0, 1.0, 500.0)
+        return Tradeoff(settings, (row, row), 1e-6, 64, Film(4, 4))
+
+    monkeypatch.setattr("diffdisp.fit_measuring.fit_tradeoff", measured)
+    words = ["tradeoff", scene, "--target", target, "-o", str(out / "new"), "--samples", "16"]
+    assert main([*words, "--seed", "3"]) == 0
+    del asked["progress"]
+    assert asked == {"object_name": None, "most": 16, "seed": 3, "depth": 50}
+    assert "The fit's own choice of samples: 0.0001 in 1 s" in capsys.readouterr().out
+    assert (out / "new" / "tradeoff.png").is_file()
+
+
 def test_ctrl_c_in_a_tradeoff_says_how_far_it_came(lit, out, capsys, monkeypatch):
     def interrupted(*_args, progress, **_options):
         progress(3, 7)
@@ -1085,6 +1104,10 @@ def test_ctrl_c_in_a_tradeoff_says_how_far_it_came(lit, out, capsys, monkeypatch
         ("-o {out}/new --bands 90:200:2", "a pole"),
         ("-o {out}/new --size 1000000x1000000", "not enough memory"),
         ("-o {out}/file/new", "is no folder"),
+        ("-o {out}/new --object ball", "--object"),
+        ("-o {out}/new --target {out}/no.npz", "no.npz"),
+        ("-o {out}/new --target {out}/no.npz --size 4x4", "--size is that of the target"),
+        ("-o {out}/new --target {out}/no.npz --bands 400:700:4", "--bands is that of the target"),
     ],
 )
 def test_a_tradeoff_that_cannot_be(scene, out, capsys, options, phrase):

@@ -9,6 +9,7 @@ from fake_fit import BANDS, blurred_ring, fake_expected, fake_result, fake_targe
 
 from diffdisp.dispersion import Sellmeier
 from diffdisp.film import Film
+from diffdisp.fit_measuring import FitMeasured, FitSetting
 from diffdisp.fitting import FreeValue, Rendered, Resampled
 from diffdisp.glasses import named_glass
 from diffdisp.image import Picture
@@ -395,8 +396,44 @@ def test_of_one_setting_no_fall_is_said():
     assert "falls" not in tradeoff_summary(one)
 
 
-def test_a_tradeoff_is_drawn(tmp_path):
-    write_tradeoff_plot(tmp_path / "tradeoff.png", fake_tradeoff())
+def fake_fit_tradeoff():
+    """The same of fits: errors of samples^-1, the fit's own choice, and other knobs."""
+    settings = [FitSetting(4**power, 50) for power in range(4)] + [FitSetting(0, 50)]
+    settings += [FitSetting(4, 8), FitSetting(4, 50, every=2), FitSetting(4, 50, shrink=4)]
+    costs = [(1e-3 * 0.25**power, 4.0**power) for power in range(4)]
+    costs += [(2e-5, 12.0), (2e-4, 3.0), (4e-4, 2.0), (9e-4, 1.5)]
+    rows = [
+        FitMeasured(1.5168, 3e-5, error, 2 * error, 0.1, 1, 30.0, seconds, seconds, 900.2)
+        for error, seconds in costs
+    ]
+    rows[4] = replace(rows[4], slope_error=float("nan"))
+    rows[7] = replace(rows[7], converged=0)
+    return Tradeoff(tuple(settings), tuple(rows), 3e-6, 256, Film(96, 96, np.array([0.5, 0.6])))
+
+
+def test_a_tradeoff_of_fits_as_a_table():
+    lines = tradeoff_table(fake_fit_tradeoff()).split("\n")
+    assert " ".join(lines[0].split()) == (
+        "setting of n_d of n of slopes n_d +- compile s s CPU s MB"
+    )
+    told = [" ".join(line.split()) for line in lines[1:9]]
+    assert told[0] == "* 1 sample, depth 50 0.001 0.002 0.1 1.5168000 3e-05 30 1 1 900"
+    assert told[4] == "* samples of its choice, depth 50 2e-05 4e-05 1.5168000 3e-05 30 12 12 900"
+    assert told[5].startswith("* 4 samples, depth 8 ")
+    assert told[6].startswith("* 4 samples, depth 50, 1 of 2 bands ")
+    assert told[7].startswith("* 4 samples, depth 50, 1/4 size 0.0009 0.0018 0.1 1.5168000 failed")
+    assert lines[10:] == [
+        "For n_d to 1e-04 take samples of its choice, depth 50: 12 s.",
+        "The error falls as samples^-1.00; halving it costs 2.0 times the time.",
+        "The fit's own choice of samples: 2e-05 in 12 s.",
+        "What the picture leaves open of n_d in any case: 3e-05.",
+        "The reference has 256 samples a pixel and an error of 3e-06 of its own.",
+    ]
+
+
+@pytest.mark.parametrize("found", [fake_tradeoff(), fake_fit_tradeoff()])
+def test_a_tradeoff_is_drawn(tmp_path, found):
+    write_tradeoff_plot(tmp_path / "tradeoff.png", found)
     width, height = size_of(tmp_path / "tradeoff.png")
     assert width > 900
     assert height > 600

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from diffdisp.color import encode_srgb
     from diffdisp.dispersion import Sellmeier
     from diffdisp.film import Film, band_middles
+    from diffdisp.fit_measuring import fit_tradeoff
     from diffdisp.fitting import (
         FitResult,
         FreeValue,
@@ -27,13 +28,21 @@ if TYPE_CHECKING:
     from diffdisp.glasses import glass_source, glass_table, load_glass, named_glass
     from diffdisp.image import Picture, linear_rgb, read_picture, write_picture
     from diffdisp.material import Dielectric, Emitter, Lambertian, Metal
+    from diffdisp.measuring import tradeoff
     from diffdisp.planning import Plan, make_plan
     from diffdisp.programs import COMPILER_OPTIONS
     from diffdisp.rendering import render
-    from diffdisp.report import result_table, write_fit_json, write_report
+    from diffdisp.report import (
+        result_table,
+        tradeoff_table,
+        write_fit_json,
+        write_report,
+        write_tradeoff_plot,
+    )
     from diffdisp.scene import Background, Object, Scene, with_glass
     from diffdisp.scene_file import SceneError, load_scene, save_scene, scene_schema
     from diffdisp.texture import Checker, Checker2D, Solid
+    from diffdisp.tolerance import render_to_tolerance
 
 __all__ = [
     "COMPILER_OPTIONS",
@@ -65,6 +74,7 @@ __all__ = [
     "encode_srgb",
     "expected_uncertainty",
     "fit",
+    "fit_tradeoff",
     "glass_source",
     "glass_table",
     "linear_rgb",
@@ -74,13 +84,17 @@ __all__ = [
     "named_glass",
     "read_picture",
     "render",
+    "render_to_tolerance",
     "result_table",
     "save_scene",
     "scene_schema",
+    "tradeoff",
+    "tradeoff_table",
     "with_glass",
     "write_fit_json",
     "write_picture",
     "write_report",
+    "write_tradeoff_plot",
 ]
 
 
@@ -104,6 +118,7 @@ _NAMES = {
     "color": ("encode_srgb",),
     "dispersion": ("Sellmeier",),
     "film": ("Film", "band_middles"),
+    "fit_measuring": ("fit_tradeoff",),
     "fitting": (
         "FitResult",
         "FreeValue",
@@ -118,13 +133,21 @@ _NAMES = {
     "glasses": ("glass_source", "glass_table", "load_glass", "named_glass"),
     "image": ("Picture", "linear_rgb", "read_picture", "write_picture"),
     "material": ("Dielectric", "Emitter", "Lambertian", "Metal"),
+    "measuring": ("tradeoff",),
     "planning": ("Plan", "make_plan"),
     "programs": ("COMPILER_OPTIONS",),
     "rendering": ("render",),
-    "report": ("result_table", "write_fit_json", "write_report"),
+    "report": (
+        "result_table",
+        "tradeoff_table",
+        "write_fit_json",
+        "write_report",
+        "write_tradeoff_plot",
+    ),
     "scene": ("Background", "Object", "Scene", "with_glass"),
     "scene_file": ("SceneError", "load_scene", "save_scene", "scene_schema"),
     "texture": ("Checker", "Checker2D", "Solid"),
+    "tolerance": ("render_to_tolerance",),
 }
 _MODULE = {name: module for module, names in _NAMES.items() for name in names}
 

@@ -28,6 +28,9 @@ TRADEOFF_SIZE = (160, 120)
 PLAN_COLUMNS = 8
 """Pictures that its slopes are: six, of a colour picture, and those along what else is free."""
 
+FIT_SAMPLES = 64
+"""Samples per pixel up to which fits are measured."""
+
 QUALITY = {"draft": 4, "standard": 16, "reference": 256}
 """Samples per pixel of each preset."""
 
@@ -236,18 +239,21 @@ _PLAN_FREE_HELP = "would be fitted too, as in fit; may be given several times"
 
 def _add_tradeoff(parser: argparse.ArgumentParser) -> None:
     parser.description = (
-        "Draw a scene with many settings, and measure the error and the time of each. Ctrl-C "
+        "Draw a scene with many settings, and measure the error and the time of each; with "
+        "--target fit its glass with them instead. Ctrl-C "
         "keeps what has been measured; the same command goes on from there."
     )
     parser.set_defaults(run=_tradeoff)
     add = parser.add_argument
     add("scene", metavar="SCENE", help="a scene file, .toml")
     add("-o", dest="output", metavar="DIR", required=True, help="for tradeoff.csv and .png")
-    size = "pixels (default {}x{})".format(*TRADEOFF_SIZE)
-    add("--size", type=_size, default=TRADEOFF_SIZE, metavar="WxH", help=size)
+    add("--target", metavar="FILE", help="a picture whose fit is measured, from the scene's glass")
+    add("--object", metavar="NAME", help="the ball to fit, where the scene has several of glass")
+    size = "pixels (default {}x{}, or the target's)".format(*TRADEOFF_SIZE)
+    add("--size", type=_size, metavar="WxH", help=size)
     add("--bands", type=_bands, metavar="LOW:HIGH:COUNT", help=_BANDS_HELP)
-    most = f"most samples per pixel (default {QUALITY['reference']})"
-    add("--samples", type=_count, default=QUALITY["reference"], metavar="N", help=most)
+    most = f"most samples per pixel (default {QUALITY['reference']}, of fits {FIT_SAMPLES})"
+    add("--samples", type=_count, metavar="N", help=most)
     add("--depth", type=_depth, default=50, metavar="N", help="most segments (default 50)")
     add("--seed", type=_seed, default=0, metavar="N", help="of random choices (default 0)")
 
@@ -608,13 +614,11 @@ def _tradeoff(options: argparse.Namespace) -> int:
     """`diffdisp tradeoff`."""
     folder = Path(options.output)
     _check_folder(folder, ("tradeoff.csv", "tradeoff.png", "reference.npz"))
-    from diffdisp.measuring import tradeoff
     from diffdisp.report import tradeoff_table, write_tradeoff_plot
     from diffdisp.scene_file import load_scene
 
     scene = load_scene(options.scene)
-    _film(options.size, options.bands, options.samples, "float64")
-    _check_glasses(scene, options.bands)
+    measure = (_measuring_fits if options.target else _measuring_pictures)(options, scene)
     _keep_compiled()
     folder.mkdir(parents=True, exist_ok=True)
     told = (0, 0)
@@ -626,22 +630,49 @@ def _tradeoff(options: argparse.Namespace) -> int:
                 told = done, total
                 _advance(bar, done, total)
 
-            found = tradeoff(
-                scene,
-                options.size,
-                options.bands,
-                folder,
-                most=options.samples,
-                depth=options.depth,
-                seed=options.seed,
-                progress=progress,
-            )
+            found = measure(folder=folder, depth=options.depth, progress=progress)
     except KeyboardInterrupt:
         holds = f"{folder} holds {told[0]} of {told[1]} settings"
         return _complain(f"interrupted: {holds}; the same command goes on", INTERRUPTED)
     write_tradeoff_plot(folder / "tradeoff.png", found)
     print(tradeoff_table(found))
     return DONE
+
+
+def _measuring_pictures(options: argparse.Namespace, scene: Any) -> Callable[..., Any]:
+    """What measures pictures of a scene.
+
+    Raises:
+        ValueError: options that belong to fits, or a picture that cannot be drawn.
+    """
+    from diffdisp.measuring import tradeoff
+
+    if options.object:
+        raise ValueError("--object names the ball of a fit: it goes with --target")
+    size, samples = options.size or TRADEOFF_SIZE, options.samples or QUALITY["reference"]
+    _film(size, options.bands, samples, "float64")
+    _check_glasses(scene, options.bands)
+    return partial(tradeoff, scene, size, options.bands, most=samples, seed=options.seed)
+
+
+def _measuring_fits(options: argparse.Namespace, scene: Any) -> Callable[..., Any]:
+    """What measures fits of a picture.
+
+    Raises:
+        ValueError: options that the target decides, or a target or ball that cannot be used.
+    """
+    from diffdisp.fit_measuring import fit_tradeoff
+    from diffdisp.fitting import glass_object
+    from diffdisp.image import read_picture
+
+    for name in ("size", "bands"):
+        if getattr(options, name):
+            raise ValueError(f"--{name} is that of the target; leave it out with --target")
+    target = read_picture(options.target)
+    glass_object(scene, options.object)
+    most = options.samples or FIT_SAMPLES
+    knobs = {"most": most, "seed": options.seed}
+    return partial(fit_tradeoff, scene, target, object_name=options.object, **knobs)
 
 
 def _glass(options: argparse.Namespace) -> int:

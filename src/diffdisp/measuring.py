@@ -8,7 +8,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -90,20 +90,25 @@ class Measured:
     cpu_s: float
     peak_memory_mb: float
 
+    @property
+    def cost(self) -> tuple[float, float]:
+        """Time and error."""
+        return self.render_s, self.error
+
 
 class Tradeoff(NamedTuple):
-    """The measured settings of a scene.
+    """The measured settings of a scene, or of fits of a picture.
 
     Args:
-        settings: in the order of measuring.
-        measured: of each.
-        reference_error: of the reference, over its root mean square.
+        settings: in the order of measuring: `Setting`, or `FitSetting`.
+        measured: of each: `Measured`, or `FitMeasured`.
+        reference_error: of the reference, over its root mean square; of fits, of its n_d.
         reference_samples: per pixel.
         film: of the pictures.
     """
 
-    settings: tuple[Setting, ...]
-    measured: tuple[Measured, ...]
+    settings: tuple[Any, ...]
+    measured: tuple[Any, ...]
     reference_error: float
     reference_samples: int
     film: Film
@@ -111,11 +116,10 @@ class Tradeoff(NamedTuple):
     @property
     def front(self) -> tuple[int, ...]:
         """Numbers of the settings than which none is both faster and nearer, the fastest first."""
-        order = sorted(range(len(self.measured)), key=lambda i: self.measured[i].render_s)
-        best, found = np.inf, []
-        for number in order:
-            if self.measured[number].error < best:
-                best = self.measured[number].error
+        costs, best, found = [row.cost for row in self.measured], np.inf, []
+        for number in sorted(range(len(costs)), key=lambda i: costs[i]):
+            if costs[number][1] < best:
+                best = costs[number][1]
                 found.append(number)
         return tuple(found)
 
@@ -126,24 +130,26 @@ class Tradeoff(NamedTuple):
         return tuple(
             number
             for number, (setting, row) in enumerate(zip(self.settings, self.measured, strict=True))
-            if replace(setting, samples=0) == first and row.error > KNOWN * self.reference_error
+            if setting.samples
+            and replace(setting, samples=0) == first
+            and row.cost[1] > KNOWN * self.reference_error
         )
 
     @property
     def fall(self) -> float:
         """Power of the number of samples by which the error falls."""
-        rows = [(float(self.settings[i].samples), self.measured[i].error) for i in self.sweep]
+        rows = [(float(self.settings[i].samples), self.measured[i].cost[1]) for i in self.sweep]
         return -_slope(rows)
 
     @property
     def price(self) -> float:
         """Times as long a picture takes whose error is half as large."""
-        rows = [(self.measured[i].error, self.measured[i].render_s) for i in self.sweep]
+        rows = [self.measured[i].cost[::-1] for i in self.sweep]
         return float(2.0 ** -_slope(rows[len(rows) // 2 :]))  # few samples cost less than the rest
 
     def fastest(self, error: float) -> int | None:
         """Number of the fastest setting with at most this error, if there is one."""
-        return next((i for i in self.front if self.measured[i].error <= error), None)
+        return next((i for i in self.front if self.measured[i].cost[1] <= error), None)
 
 
 def _slope(rows: Sequence[tuple[float, float]]) -> float:
@@ -222,7 +228,7 @@ def tradeoff(
         save_scene(scene, saved)
         asked = json.dumps([saved.read_text(encoding="utf-8"), size, bands, most, depth, seed])
         key = hashlib.sha256(f"{asked} {surroundings()}".encode()).hexdigest()
-        rows = dict(_kept_rows(folder, key))
+        rows = dict(kept_rows(folder, key, Setting, Measured))
         tell = progress or (lambda done, of: None)
         tell(len(rows), len(settings))
         reference, own_error = _reference(scene, film, folder, key, most, depth, seed)
@@ -232,7 +238,7 @@ def tradeoff(
             drawing = _Drawing(saved, size, bands, seed)
             picture, timing = _drawn(drawing, setting, Path(scratch))
             rows[setting] = Measured(*_errors(picture, reference, own_error), **timing)
-            _keep_rows(folder, key, rows)
+            keep_rows(folder, key, rows)
             tell(len(rows), len(settings))
     measured = tuple(rows[setting] for setting in settings)
     assert reference.samples is not None
@@ -377,28 +383,38 @@ def delta_e(
 # Rows that are kept.
 
 
-_FIELDS = [field.name for kind in (Setting, Measured) for field in fields(kind)]
+def keep_rows(folder: Path, key: str, rows: Mapping[Any, Any]) -> None:
+    """Write tradeoff.csv, whole or not at all.
 
-
-def _keep_rows(folder: Path, key: str, rows: dict[Setting, Measured]) -> None:
-    """Write tradeoff.csv, whole or not at all."""
+    Args:
+        folder: where to.
+        key: of what is measured; it stands in each row.
+        rows: what was measured, one dataclass for each setting, which is one too.
+    """
+    lines = [{**asdict(setting), **asdict(row), "key": key} for setting, row in rows.items()]
     with (
         replacing(folder / "tradeoff.csv") as beside,
         beside.open("w", encoding="utf-8", newline="") as file,
     ):
-        writer = csv.DictWriter(file, [*_FIELDS, "key"])
+        writer = csv.DictWriter(file, list(lines[0]))
         writer.writeheader()
-        for setting, row in rows.items():
-            writer.writerow({**asdict(setting), **asdict(row), "key": key})
+        writer.writerows(lines)
 
 
-def _kept_rows(folder: Path, key: str) -> Iterator[tuple[Setting, Measured]]:
-    """What tradeoff.csv holds that was measured for the same."""
+def kept_rows(folder: Path, key: str, setting: Any, measured: Any) -> Iterator[tuple[Any, Any]]:
+    """What tradeoff.csv holds that was measured for the same.
+
+    Args:
+        folder: where it is looked for.
+        key: as in `keep_rows`.
+        setting: the dataclass of settings, of numbers and words.
+        measured: that of what was measured.
+    """
     try:
         with (folder / "tradeoff.csv").open(encoding="utf-8", newline="") as file:
             kept = [row for row in csv.DictReader(file) if row.get("key") == key]
         for row in kept:
-            yield _of_row(Setting, row), _of_row(Measured, row)
+            yield _of_row(setting, row), _of_row(measured, row)
     except (OSError, ValueError, KeyError, TypeError):
         return
 

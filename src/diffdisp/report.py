@@ -18,6 +18,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocat
 
 from diffdisp.color import encode_srgb
 from diffdisp.dispersion import Sellmeier
+from diffdisp.fit_measuring import FitMeasured, FitSetting
 from diffdisp.fitting import FitResult, Rendered, Resampled, Uncertainty
 from diffdisp.glasses import named_glass
 from diffdisp.image import Picture, linear_rgb, replacing
@@ -30,8 +31,8 @@ UNDETERMINED = 0.1
 LEAST_PROBABILITY = 5e-4
 """What the table shows of a probability is rounded to 0.001."""
 
-TRADED = (0.1, 0.03, 0.01)
-"""Errors for which the fastest setting is said."""
+TRADED, FIT_TRADED = (0.1, 0.03, 0.01), (1e-4, 1e-5, 1e-6)
+"""Errors, of pictures and of n_d, for which the fastest setting is said."""
 
 PLOT_LIMITS = (0.1, 50.0)
 """Wavelengths that a plot of a glass shows at most, µm."""
@@ -602,13 +603,13 @@ def tradeoff_table(found: Tradeoff) -> str:
     Returns:
         Lines without a newline after the last one.
     """
-    head = ("", "setting", "error", "ΔE", "99 %", "compile s", "s", "CPU s", "MB")
-    rows = [list(head)]
+    fits = isinstance(found.settings[0], FitSetting)
+    columns, describe = (FIT_COLUMNS, _fit_cells) if fits else (COLUMNS, _picture_cells)
+    rows = [["", "setting", *columns, "MB"]]
     for number, (setting, row) in enumerate(zip(found.settings, found.measured, strict=True)):
-        told = [_error_words(row, found), f"{row.delta_e_mean:.2f}", f"{row.delta_e_p99:.2f}"]
-        told += [f"{value:.3g}" for value in (row.compile_s, row.render_s, row.cpu_s)]
         mark = "*" if number in found.front else ""
-        rows.append([mark, setting_words(setting), *told, f"{row.peak_memory_mb:.0f}"])
+        memory = f"{row.peak_memory_mb:.0f}"
+        rows.append([mark, setting_words(setting), *describe(row, found), memory])
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = []
     for mark, name, *told in rows:
@@ -617,41 +618,79 @@ def tradeoff_table(found: Tradeoff) -> str:
     return "\n".join([*lines, "", tradeoff_summary(found)])
 
 
-def _error_words(row: Measured, found: Tradeoff) -> str:
+COLUMNS = ("error", "ΔE", "99 %", "compile s", "s", "CPU s")
+FIT_COLUMNS = ("of n_d", "of n", "of slopes", "n_d", "+-", "compile s", "s", "CPU s")
+"""Head of the tables of pictures and of fits, between the setting and the memory."""
+
+
+def _picture_cells(row: Measured, found: Tradeoff) -> list[str]:
+    """The columns of a picture's row."""
+    told = [_error_words(row, found), f"{row.delta_e_mean:.2f}", f"{row.delta_e_p99:.2f}"]
+    return told + [f"{value:.3g}" for value in (row.compile_s, row.render_s, row.cpu_s)]
+
+
+def _fit_cells(row: FitMeasured, found: Tradeoff) -> list[str]:
+    """The columns of a fit's row."""
+    slopes = "" if math.isnan(row.slope_error) else f"{row.slope_error:.2g}"
+    told = [_error_words(row, found), f"{row.n_error:.2g}", slopes]
+    told += [f"{row.n_d:.7f}", f"{row.n_d_std:.2g}" if row.converged else "failed"]
+    return told + [f"{value:.3g}" for value in (row.compile_s, row.fit_s, row.cpu_s)]
+
+
+def _error_words(row: Measured | FitMeasured, found: Tradeoff) -> str:
     """The error, or that it is smaller than what the reference can tell."""
-    if row.error > found.reference_error:
-        return f"{row.error:.2g}"
+    _, error = row.cost
+    if error > found.reference_error:
+        return f"{error:.2g}"
     return f"<{found.reference_error:.1g}"
 
 
-def setting_words(setting: Setting) -> str:
+def setting_words(setting: Setting | FitSetting) -> str:
     """A setting, of which the samples are always said and the rest where it is not as usual."""
-    words = [_count(setting.samples, "sample"), f"depth {setting.depth}"]
-    words += [setting.dtype] if setting.dtype != "float32" else []
-    words += [_bands(setting.bands)] if setting.bands else []
+    words = [_count(setting.samples, "sample") if setting.samples else "samples of its choice"]
+    words += [f"depth {setting.depth}"]
+    if isinstance(setting, FitSetting):
+        words += [f"1 of {setting.every} bands"] if setting.every > 1 else []
+    else:
+        words += [setting.dtype] if setting.dtype != "float32" else []
+        words += [_bands(setting.bands)] if setting.bands else []
     words += [f"1/{setting.shrink} size"] if setting.shrink > 1 else []
     return ", ".join(words)
 
 
 def tradeoff_summary(found: Tradeoff) -> str:
-    """What to take for an error of 10, 3 and 1 %, and what half of an error costs."""
+    """What to take for some errors, and what half of an error costs."""
+    fits = isinstance(found.settings[0], FitSetting)
     said = []
-    for error in TRADED:
+    for error in FIT_TRADED if fits else TRADED:
         number = found.fastest(error)
         if number is not None:
-            setting, row = found.settings[number], found.measured[number]
-            said.append(f"for {error:.0%} take {setting_words(setting)}: {row.render_s:.2g} s")
+            seconds, _ = found.measured[number].cost
+            wanted = f"n_d to {error:.0e}" if fits else f"{error:.0%}"
+            said.append(
+                f"for {wanted} take {setting_words(found.settings[number])}: {seconds:.2g} s"
+            )
     sentences = [*said]
     if math.isfinite(found.fall) and math.isfinite(found.price):
         sentences.append(
             f"the error falls as samples^-{found.fall:.2f}; halving it costs"
             f" {found.price:.1f} times the time"
         )
-    reference = (
+    if fits:
+        sentences += _choice_words(found)
+    sentences.append(
         f"the reference has {found.reference_samples} samples a pixel and an error of"
         f" {found.reference_error:.1g} of its own"
     )
-    return "\n".join(f"{text[0].upper()}{text[1:]}." for text in [*sentences, reference])
+    return "\n".join(f"{text[0].upper()}{text[1:]}." for text in sentences)
+
+
+def _choice_words(found: Tradeoff) -> list[str]:
+    """What the fit's own choice of samples gives, and what noise leaves open anyway."""
+    number = next(i for i, setting in enumerate(found.settings) if not setting.samples)
+    row = found.measured[number]
+    choice = f"the fit's own choice of samples: {row.n_d_error:.1g} in {row.fit_s:.2g} s"
+    return [choice, f"what the picture leaves open of n_d in any case: {row.n_d_std:.1g}"]
 
 
 def write_tradeoff_plot(path: str | os.PathLike[str], found: Tradeoff) -> None:
@@ -676,7 +715,7 @@ def write_tradeoff_plot(path: str | os.PathLike[str], found: Tradeoff) -> None:
         kinds.setdefault(_turned(setting, found.settings[0]), []).append(number)
     for (kind, numbers), marker in zip(kinds.items(), "osD^v<>P", strict=False):
         rows = [found.measured[number] for number in numbers]
-        seconds, errors = [row.render_s for row in rows], [row.error for row in rows]
+        seconds, errors = zip(*(row.cost for row in rows), strict=True)
         line = "-" if kind == "samples alone" else ""
         axis.plot(seconds, errors, marker, linestyle=line, markersize=6, label=kind, alpha=0.8)
         for number, x, y in zip(numbers, seconds, errors, strict=True):
@@ -684,16 +723,16 @@ def write_tradeoff_plot(path: str | os.PathLike[str], found: Tradeoff) -> None:
             axis.annotate(text, (x, y), (4, 4), textcoords="offset points", fontsize=8)
     front = [found.measured[number] for number in found.front]
     axis.step(
-        [row.render_s for row in front],
-        [row.error for row in front],
+        *zip(*(row.cost for row in front), strict=True),
         where="post",
         color="0.6",
         zorder=0,
         label="nothing is faster and nearer",
     )
     axis.axhline(found.reference_error, color="0.6", linestyle=":", label="error of the reference")
-    axis.set_xlabel("time of a render (s)")
-    axis.set_ylabel("relative root mean square error")
+    fits = isinstance(found.settings[0], FitSetting)
+    axis.set_xlabel(f"time of a {'fit' if fits else 'render'} (s)")
+    axis.set_ylabel("error of n_d" if fits else "relative root mean square error")
     film = found.film
     channels = "colour" if film.wavelengths is None else _bands(film.channels)
     axis.set_title(f"{film.width} x {film.height} pixels, {channels}")
@@ -702,23 +741,31 @@ def write_tradeoff_plot(path: str | os.PathLike[str], found: Tradeoff) -> None:
     _save(figure, path)
 
 
-def _turned(setting: Setting, usual: Setting) -> str:
+def _turned(setting: Setting | FitSetting, usual: Setting | FitSetting) -> str:
     """Which knob a setting turns beside the samples."""
-    if setting.bands:
-        return "bands for colour"
     if setting.shrink > 1:
         return "smaller picture"
-    if setting.dtype != usual.dtype:
+    if isinstance(setting, FitSetting):
+        if not setting.samples:
+            return "the fit's own choice"
+        if setting.every > 1:
+            return "fewer bands"
+    elif setting.bands:
+        return "bands for colour"
+    elif isinstance(usual, Setting) and setting.dtype != usual.dtype:
         return setting.dtype
     return "shorter paths" if setting.depth != usual.depth else "samples alone"
 
 
-def _mark_words(setting: Setting, kind: str) -> str:
+def _mark_words(setting: Setting | FitSetting, kind: str) -> str:
     """What tells a point from the others of its kind."""
-    which = {"bands for colour": setting.bands, "shorter paths": setting.depth}
     if kind == "smaller picture":
         return f"1/{setting.shrink}"
-    return str(which.get(kind, setting.samples))
+    if kind == "shorter paths":
+        return str(setting.depth)
+    if isinstance(setting, FitSetting):
+        return f"1/{setting.every}" if setting.every > 1 else str(setting.samples or "")
+    return str(setting.bands or setting.samples)
 
 
 # One glass.
