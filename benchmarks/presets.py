@@ -2,7 +2,7 @@
 
 Error and time of pictures over samples and the length of paths; the front is what no other setting
 is both faster and nearer than. A preset's excess is its time over that of the fastest setting that
-is as near. Writes what `render --plan` tells of presets, too: root mean square errors.
+is as near. Their errors are those that `render --plan` tells.
 """
 
 import argparse
@@ -13,8 +13,8 @@ from record import ROOT, print_table, write_record
 from tolerances import SCENES, Truth, timed
 
 from diffdisp import Film, load_scene, render
-from diffdisp.__main__ import QUALITY
 from diffdisp.planning import make_plan
+from diffdisp.presets import PRESETS
 
 SAMPLES = (1, 2, 4, 8, 16, 32, 64, 128, 256)
 DEPTHS = (50, 16, 8)
@@ -49,13 +49,14 @@ def main() -> None:
     """Print the presets' rows; write results/presets.json."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--size", type=int, nargs=2, default=(160, 120), help="pixels")
-    parser.add_argument("--reference", type=int, default=576, help="samples of the measure")
+    parser.add_argument("--reference", type=int, default=144, help="samples of the measure")
     parser.add_argument("--by-chance", type=int, default=8192, help="the same of scattered light")
     parser.add_argument("--runs", type=int, default=7, help="warm ones, for the median")
     options = parser.parse_args()
     rows = [row for name in SCENES for row in measure(name, options)]
     shown = ("scene", "samples", "error", "wall_s", "cpu_s", "excess")
-    presets = [row for row in rows if row["samples"] in QUALITY.values() and row["depth"] == 50]
+    counts = [preset.samples for preset in PRESETS.values()]
+    presets = [row for row in rows if row["samples"] in counts and row["depth"] == DEPTHS[0]]
     print_table(shown, [[row[column] for column in shown] for row in presets])
     near = sum(row["excess"] <= WITHIN for row in presets)
     print(f"{near} of {len(presets)} presets take at most {WITHIN:g} times the front's time")

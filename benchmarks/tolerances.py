@@ -177,7 +177,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, nargs=2, default=(160, 120), help="pixels")
     tolerances = (0.1, 0.03, 0.01, 0.003)
     parser.add_argument("--tolerances", type=float, nargs="+", default=tolerances)
-    parser.add_argument("--reference", type=int, default=576, help="samples of the measure")
+    parser.add_argument("--reference", type=int, default=144, help="samples of the measure")
     parser.add_argument("--by-chance", type=int, default=8192, help="the same of scattered light")
     parser.add_argument("--runs", type=int, default=5, help="warm ones, for the median")
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=SCENES)

@@ -39,6 +39,7 @@ ORDER = (
     "measuring",
     "fit_measuring",
     "report",
+    "presets",
     "__main__",
 )
 

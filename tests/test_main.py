@@ -678,6 +678,7 @@ def test_quality_and_defaults(scene, capsys, options, samples):
     assert f"samples    {samples} a pixel" in told.out
     assert "depth      50 segments" in told.out
     assert "dtype      float32" in told.out
+    assert ("\nquality    " in told.out) == ("--samples" not in options)
     assert told.err == ""
 
 

@@ -166,11 +166,11 @@ def test_of_traced_numbers_the_general_case_is_assumed():
 @pytest.mark.parametrize(
     ("radius", "height", "dtype", "fine"),
     [
-        (999.0, 1.0, "float32", False),  # beside a ball of 1
-        (1001.0, 1.0, "float32", True),
-        (1001.0, 1.0, "float64", False),
-        (500.0, 0.6, "float32", False),  # to a camera so far above it
-        (500.0, 0.4, "float32", True),
+        (49.0, 1.0, "float32", False),  # beside a ball of 1
+        (51.0, 1.0, "float32", True),
+        (51.0, 1.0, "float64", False),
+        (25.0, 0.6, "float32", False),  # to a camera so far above it
+        (25.0, 0.4, "float32", True),
     ],
 )
 def test_very_large_spheres_take_more_digits(radius, height, dtype, fine):

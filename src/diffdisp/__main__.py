@@ -15,6 +15,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NoReturn
 
+from diffdisp.presets import PRESETS
+
 DONE, BAD_INPUT, NOT_CONVERGED, INTERRUPTED = 0, 2, 3, 130
 """Exit statuses; 130 is what shells give for Ctrl-C."""
 
@@ -30,9 +32,6 @@ PLAN_COLUMNS = 8
 
 FIT_SAMPLES = 64
 """Samples per pixel up to which fits are measured."""
-
-QUALITY = {"draft": 4, "standard": 16, "reference": 256}
-"""Samples per pixel of each preset."""
 
 WARM_RENDERS = 5
 """Renders whose median is told as the time of one."""
@@ -155,14 +154,14 @@ def _parser() -> argparse.ArgumentParser:
 def _add_render(parser: argparse.ArgumentParser) -> None:
     parser.description = "Draw a scene: in linear sRGB, or the radiance in bands of wavelength."
     parser.set_defaults(run=_render)
-    presets = ", ".join(f"{name} = {samples}" for name, samples in QUALITY.items())
+    presets = ", ".join(f"{name} = {preset.samples}" for name, preset in PRESETS.items())
     add = parser.add_argument
     add("scene", metavar="SCENE", help="a scene file, .toml")
     add("-o", dest="output", metavar="OUT", help=".png (sRGB), .tiff or .exr (float32), .npz")
     add("--size", type=_size, default=(480, 480), metavar="WxH", help="pixels (default 480x480)")
     accuracy = parser.add_mutually_exclusive_group()
     quality = f"samples per pixel: {presets} (default standard)"
-    accuracy.add_argument("--quality", choices=QUALITY, help=quality)
+    accuracy.add_argument("--quality", choices=PRESETS, help=quality)
     accuracy.add_argument("--tolerance", type=_positive, metavar="T", help=_TOLERANCE_HELP)
     add("--samples", type=_count, metavar="N", help="samples per pixel (default: by --quality)")
     add("--depth", type=_depth, default=50, metavar="N", help="segments of a path (default 50)")
@@ -252,7 +251,8 @@ def _add_tradeoff(parser: argparse.ArgumentParser) -> None:
     size = "pixels (default {}x{}, or the target's)".format(*TRADEOFF_SIZE)
     add("--size", type=_size, metavar="WxH", help=size)
     add("--bands", type=_bands, metavar="LOW:HIGH:COUNT", help=_BANDS_HELP)
-    most = f"most samples per pixel (default {QUALITY['reference']}, of fits {FIT_SAMPLES})"
+    usual = PRESETS["reference"].samples
+    most = f"most samples per pixel (default {usual}, of fits {FIT_SAMPLES})"
     add("--samples", type=_count, metavar="N", help=most)
     add("--depth", type=_depth, default=50, metavar="N", help="most segments (default 50)")
     add("--seed", type=_seed, default=0, metavar="N", help="of random choices (default 0)")
@@ -346,7 +346,8 @@ def _render(options: argparse.Namespace) -> int:
     from diffdisp.scene_file import load_scene
 
     scene = load_scene(options.scene)
-    samples = options.samples or QUALITY[options.quality or "standard"]
+    preset = PRESETS[options.quality or "standard"]
+    samples = options.samples or preset.samples
     dtype = "float64" if options.float64 else "float32"
     film = _film(options.size, options.bands, samples, dtype)
     if options.output:
@@ -356,6 +357,8 @@ def _render(options: argparse.Namespace) -> int:
         print(make_plan(scene, film, samples, options.depth, dtype))
         if options.tolerance:
             print(f"tolerance  {options.tolerance:g}: other samples, chosen while drawing")
+        elif not options.samples:
+            print(f"quality    {options.quality or 'standard'}, {preset}")
     if not options.output:
         return DONE
     _keep_compiled()
@@ -649,7 +652,7 @@ def _measuring_pictures(options: argparse.Namespace, scene: Any) -> Callable[...
 
     if options.object:
         raise ValueError("--object names the ball of a fit: it goes with --target")
-    size, samples = options.size or TRADEOFF_SIZE, options.samples or QUALITY["reference"]
+    size, samples = options.size or TRADEOFF_SIZE, options.samples or PRESETS["reference"].samples
     _film(size, options.bands, samples, "float64")
     _check_glasses(scene, options.bands)
     return partial(tradeoff, scene, size, options.bands, most=samples, seed=options.seed)

