@@ -13,7 +13,6 @@ from diffdisp.glasses import named_glass
 from diffdisp.image import Picture
 from diffdisp.rendering import render
 from diffdisp.scene import Scene
-from diffdisp.tolerance import rms
 
 BANDS = Film(16, 12, np.array([0.42, 0.48, 0.55, 0.65]))
 START = bench(named_glass("fused silica"))
@@ -117,21 +116,20 @@ def test_two_balls_without_a_name_are_refused(tmp_path):
 
 
 def test_fits_are_measured(tmp_path, monkeypatch):
-    grid = (FitSetting(1, 8), FitSetting(4, 8))
-    monkeypatch.setattr(fit_measuring, "fit_grid", lambda *_: grid)
+    monkeypatch.setattr(fit_measuring, "fit_grid", lambda *_: (FitSetting(1, 8),))
     monkeypatch.setattr(fit_measuring, "WARM_FITS", 1)
     radiance = np.asarray(render(bench(BK7), BANDS, samples=64, dtype="float64"))
     noise = np.random.default_rng(0).normal(0.0, 0.003, radiance.shape)
     target = Picture(radiance + noise, BANDS.wavelengths)
-    found = fit_tradeoff(START, target, tmp_path, most=4, depth=8)
-    few, more = found.measured
-    assert isinstance(few, FitMeasured)
-    assert few.converged == more.converged == 1
-    assert 0 < more.n_d_error < few.n_d_error < 1e-2
-    assert 0 < more.n_error < few.n_error < 1e-2
-    assert 0 < more.slope_error < few.slope_error < 1
-    assert few.compile_s > few.fit_s > 0
-    assert few.cpu_s > 0
-    assert few.peak_memory_mb > 50
-    # The error that fits report knows the noise, and so do their distances from the truth.
-    assert rms(np.array([row.n_d - 1.5168 for row in found.measured])) < 10 * more.n_d_std + 1e-3
+    found = fit_tradeoff(START, target, tmp_path, most=1, depth=8)
+    (row,) = found.measured
+    assert isinstance(row, FitMeasured)
+    assert row.converged == 1
+    assert row.n_d == pytest.approx(1.5168, abs=5e-3)
+    assert 0 < row.n_d_error < 5e-3
+    assert 0 < row.n_error < 5e-3
+    assert 0 < row.slope_error < 1
+    assert row.compile_s > row.fit_s > 0
+    assert row.cpu_s > 0
+    assert row.peak_memory_mb > 50
+    assert 0 < found.reference_error < row.n_d_error
