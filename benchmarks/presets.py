@@ -9,7 +9,7 @@ import argparse
 from typing import Any
 
 import numpy as np
-from record import ROOT, print_table, write_record
+from record import ROOT, print_table, recorded, write_record
 from tolerances import SCENES, Truth, timed
 
 from diffdisp import Film, load_scene, render
@@ -49,11 +49,16 @@ def main() -> None:
     """Print the presets' rows; write results/presets.json."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--size", type=int, nargs=2, default=(160, 120), help="pixels")
-    parser.add_argument("--reference", type=int, default=144, help="samples of the measure")
+    parser.add_argument("--reference", type=int, default=256, help="samples of the measure")
     parser.add_argument("--by-chance", type=int, default=8192, help="the same of scattered light")
     parser.add_argument("--runs", type=int, default=7, help="warm ones, for the median")
+    parser.add_argument("--only", nargs="+", choices=SCENES, help="and keep the record's others")
     options = parser.parse_args()
-    rows = [row for name in SCENES for row in measure(name, options)]
+    names = options.only or SCENES
+    rows = [row for row in recorded("presets") if row["scene"] not in names] if options.only else []
+    for name in names:
+        rows += measure(name, options)
+        print(f"{name} done", flush=True)
     shown = ("scene", "samples", "error", "wall_s", "cpu_s", "excess")
     counts = [preset.samples for preset in PRESETS.values()]
     presets = [row for row in rows if row["samples"] in counts and row["depth"] == DEPTHS[0]]
