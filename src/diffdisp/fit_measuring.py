@@ -205,9 +205,10 @@ def fit_tradeoff(
             keep_rows(folder, key, rows)
             tell(len(rows), len(settings))
     measured = tuple(rows[setting] for setting in settings)
-    finest = rows[FitSetting(1 << most.bit_length() - 1, depth)]
+    finest = 1 << most.bit_length() - 1  # the most that stand among the settings
     alike = correlation(make_plan(scene, target.film, most, depth, "float64"))
-    own = finest.n_d_error / difference(most, REFERENCE * most, alike) * REFERENCE**-FALL
+    apart = rows[FitSetting(finest, depth)].n_d_error
+    own = apart / difference(finest, REFERENCE * most, alike) * (REFERENCE * most / finest) ** -FALL
     return Tradeoff(settings, measured, own, REFERENCE * most, target.film)
 
 
@@ -322,6 +323,8 @@ def _one(asked: dict[str, Any]) -> dict[str, float]:
     for _ in range(1 + asked["warm"]):
         start, busy = time.perf_counter(), time.process_time()
         result = fit(scene, target, object_name=name)
+        if result.stopped:  # by Ctrl-C: it is no row
+            raise KeyboardInterrupt
         walls.append(time.perf_counter() - start)
         cpus.append(time.process_time() - busy)
         if len(walls) > 1 and walls[-1] > LONG_S:

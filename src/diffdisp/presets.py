@@ -29,7 +29,7 @@ class Preset(NamedTuple):
 
 
 PRESETS = {
-    "draft": Preset(4, 0.0077, (0.069, 0.14)),
-    "standard": Preset(16, 0.0033, (0.028, 0.055)),
-    "reference": Preset(256, 0.0, (0.0047, 0.0096)),
+    "draft": Preset(4, 0.0075, (0.069, 0.14)),
+    "standard": Preset(16, 0.0035, (0.028, 0.055)),
+    "reference": Preset(256, 0.00069, (0.0047, 0.0096)),
 }
