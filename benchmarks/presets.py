@@ -49,8 +49,8 @@ def main() -> None:
     """Print the presets' rows; write results/presets.json."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--size", type=int, nargs=2, default=(160, 120), help="pixels")
-    parser.add_argument("--reference", type=int, default=256, help="samples of the measure")
-    parser.add_argument("--by-chance", type=int, default=8192, help="the same of scattered light")
+    parser.add_argument("--reference", type=int, default=256, help="most samples told apart")
+    parser.add_argument("--by-chance", type=int, default=2048, help="the same of scattered light")
     parser.add_argument("--runs", type=int, default=7, help="warm ones, for the median")
     parser.add_argument("--only", nargs="+", choices=SCENES, help="and keep the record's others")
     options = parser.parse_args()

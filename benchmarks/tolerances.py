@@ -7,7 +7,6 @@ nobody knows who has not measured them.
 
 import argparse
 import math
-import statistics
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -16,9 +15,11 @@ import numpy as np
 from record import ROOT, print_table, write_record
 
 from diffdisp import Film, Scene, load_scene, render
+from diffdisp.measuring import converged, error_beyond
 from diffdisp.planning import make_plan
 from diffdisp.sampling import sample_grid
-from diffdisp.tolerance import correlation, difference, relative, render_to_tolerance, rms
+from diffdisp.timing import warm_times
+from diffdisp.tolerance import render_to_tolerance, rms
 
 SCENES = ("bench_nbk7", "dispersion", "metal_and_matte", "lamps", "default")
 """The bench and the gallery."""
@@ -37,41 +38,21 @@ LONG_S = 10.0
 class Truth:
     """A scene's picture, and how far others are from it."""
 
-    def __init__(self, scene: Scene, film: Film, samples: int) -> None:
-        """By pictures of `samples`, and of four times that where nothing is left to chance."""
-        plan = make_plan(scene, film, samples, 50, "float64")
-        counts = (samples, samples if plan.scattering else 4 * samples)
-        one, other = (
-            np.asarray(render(scene, film, samples=count, seed=SEED + k, dtype="float64"))
-            for k, count in enumerate(counts)
-        )
-        apart = rms(one - other)
-        if plan.scattering:
-            self.picture, self.own = (one + other) / 2, apart / 2
-        else:
-            of_one = apart / difference(*counts, correlation(plan))
-            self.picture, self.own = other, of_one * (counts[0] / counts[1]) ** 0.6
-        self.size = rms(self.picture)
+    def __init__(self, scene: Scene, film: Film, most: int) -> None:
+        """By which those of at most so many samples are measured."""
+        self.picture, _, self.own = converged(scene, film, most, 50, SEED)
 
     def error(self, picture: np.ndarray) -> float:
         """Root mean square of a picture's error over that of the picture."""
-        square = rms(np.asarray(picture) - self.picture) ** 2 - self.own**2
-        return relative(math.sqrt(max(square, 0.0)), self.size)
+        return error_beyond(picture, self.picture, self.own)
 
 
 def timed(draw: Callable[[], Any], runs: int) -> tuple[Any, dict[str, float]]:
     """What is drawn, and the median time of warm runs; the first compiles."""
     start = time.perf_counter()
-    found = draw()
-    first, walls, cpus = time.perf_counter() - start, [], []
-    for _ in range(runs):
-        before = time.perf_counter(), time.process_time()
-        found = draw()
-        walls.append(time.perf_counter() - before[0])
-        cpus.append(time.process_time() - before[1])
-        if walls[-1] > LONG_S:
-            break
-    wall, cpu = statistics.median(walls), statistics.median(cpus)
+    draw()
+    first = time.perf_counter() - start
+    found, wall, cpu = warm_times(draw, runs, LONG_S)
     return found, {"wall_s": wall, "cpu_s": cpu, "first_s": first}
 
 
@@ -121,7 +102,7 @@ class Fixed:
             high += 4
         low = high - 4
         while high - low > 1 and high > 0:
-            middle = max((low + high) // 2, 0)
+            middle = (low + high) // 2
             if self.error(middle) > tolerance:
                 low = middle
             else:
@@ -167,7 +148,7 @@ def measure(name: str, options: argparse.Namespace) -> Iterator[dict[str, Any]]:
                 "fewest_first_s": best["first_s"],
                 "wall_ratio": taken["wall_s"] / best["wall_s"],
                 "cpu_ratio": taken["cpu_s"] / best["cpu_s"],
-                "truth_error": relative(truth.own, truth.size),
+                "truth_error": truth.own,
             }
 
 
@@ -177,8 +158,8 @@ def main() -> None:
     parser.add_argument("--size", type=int, nargs=2, default=(160, 120), help="pixels")
     tolerances = (0.1, 0.03, 0.01, 0.003)
     parser.add_argument("--tolerances", type=float, nargs="+", default=tolerances)
-    parser.add_argument("--reference", type=int, default=144, help="samples of the measure")
-    parser.add_argument("--by-chance", type=int, default=8192, help="the same of scattered light")
+    parser.add_argument("--reference", type=int, default=144, help="most samples told apart")
+    parser.add_argument("--by-chance", type=int, default=2048, help="the same of scattered light")
     parser.add_argument("--runs", type=int, default=5, help="warm ones, for the median")
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=SCENES)
     options = parser.parse_args()

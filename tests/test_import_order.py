@@ -8,6 +8,8 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "src" / "diffdisp"
 ORDER = (
+    "presets",
+    "timing",
     "vector",
     "dispersion",
     "glasses",
@@ -39,7 +41,6 @@ ORDER = (
     "measuring",
     "fit_measuring",
     "report",
-    "presets",
     "__main__",
 )
 

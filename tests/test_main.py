@@ -1086,6 +1086,14 @@ def test_tradeoff_of_fits(scene, target, out, capsys, monkeypatch):
     assert (out / "new" / "tradeoff.png").is_file()
 
 
+def test_a_target_beyond_the_glass_is_refused_before_anything_is_made(scene, out, tmp_path, capsys):
+    path = tmp_path / "ultraviolet.npz"
+    write_picture(path, Picture(np.ones((6, 8, 2)), np.array([0.09, 0.2])))
+    words = ["tradeoff", scene, "--target", str(path), "-o", str(out / "new")]
+    refused(capsys, words, "a pole")
+    assert list(out.iterdir()) == []
+
+
 def test_ctrl_c_in_a_tradeoff_says_how_far_it_came(lit, out, capsys, monkeypatch):
     def interrupted(*_args, progress, **_options):
         progress(3, 7)

@@ -15,7 +15,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NoReturn
 
-from diffdisp.presets import PRESETS
+from diffdisp.presets import MOST_FITTED, PRESETS
 
 DONE, BAD_INPUT, NOT_CONVERGED, INTERRUPTED = 0, 2, 3, 130
 """Exit statuses; 130 is what shells give for Ctrl-C."""
@@ -29,9 +29,6 @@ TRADEOFF_SIZE = (160, 120)
 """Pixels of a picture that is drawn with many settings."""
 PLAN_COLUMNS = 8
 """Pictures that its slopes are: six, of a colour picture, and those along what else is free."""
-
-FIT_SAMPLES = 64
-"""Samples per pixel up to which fits are measured."""
 
 WARM_RENDERS = 5
 """Renders whose median is told as the time of one."""
@@ -252,7 +249,7 @@ def _add_tradeoff(parser: argparse.ArgumentParser) -> None:
     add("--size", type=_size, metavar="WxH", help=size)
     add("--bands", type=_bands, metavar="LOW:HIGH:COUNT", help=_BANDS_HELP)
     usual = PRESETS["reference"].samples
-    most = f"most samples per pixel (default {usual}, of fits {FIT_SAMPLES})"
+    most = f"most samples per pixel (default {usual}, of fits {MOST_FITTED})"
     add("--samples", type=_count, metavar="N", help=most)
     add("--depth", type=_depth, default=50, metavar="N", help="most segments (default 50)")
     add("--seed", type=_seed, default=0, metavar="N", help="of random choices (default 0)")
@@ -508,26 +505,18 @@ def _grow(
 
 def _timed(build: Callable[[], object], draw: Callable[[], Any]) -> tuple[Any, dict[str, float]]:
     """The picture, and how long it takes to compile and to draw, by the clock and on all cores."""
-    import resource
-    import statistics
+    from diffdisp.timing import peak_memory_mb, warm_times
 
     start = time.perf_counter()
     build()
     compiled = time.perf_counter() - start
     draw()
-    seconds, busy = [], []
-    for _ in range(WARM_RENDERS):
-        start, start_busy = time.perf_counter(), time.process_time()
-        picture = draw()
-        seconds.append(time.perf_counter() - start)
-        busy.append(time.process_time() - start_busy)
-    # Linux counts in KiB, macOS in bytes.
-    unit = 1 if sys.platform == "darwin" else 1024
+    picture, seconds, busy = warm_times(draw, WARM_RENDERS)
     return picture, {
         "compile_s": compiled,
-        "render_s": statistics.median(seconds),
-        "cpu_s": statistics.median(busy),
-        "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6,
+        "render_s": seconds,
+        "cpu_s": busy,
+        "peak_memory_mb": peak_memory_mb(),
     }
 
 
@@ -664,6 +653,7 @@ def _measuring_fits(options: argparse.Namespace, scene: Any) -> Callable[..., An
     Raises:
         ValueError: options that the target decides, or a target or ball that cannot be used.
     """
+    from diffdisp.chunks import check_glasses, film_range
     from diffdisp.fit_measuring import fit_tradeoff
     from diffdisp.fitting import glass_object
     from diffdisp.image import read_picture
@@ -673,7 +663,8 @@ def _measuring_fits(options: argparse.Namespace, scene: Any) -> Callable[..., An
             raise ValueError(f"--{name} is that of the target; leave it out with --target")
     target = read_picture(options.target)
     glass_object(scene, options.object)
-    most = options.samples or FIT_SAMPLES
+    check_glasses(scene, *film_range(target.film))
+    most = options.samples or MOST_FITTED
     knobs = {"most": most, "seed": options.seed}
     return partial(fit_tradeoff, scene, target, object_name=options.object, **knobs)
 

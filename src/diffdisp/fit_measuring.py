@@ -3,9 +3,6 @@
 import hashlib
 import json
 import os
-import resource
-import statistics
-import subprocess
 import sys
 import tempfile
 import time
@@ -21,19 +18,17 @@ from jaxtyping import Float
 
 from diffdisp.chunks import check_glasses, film_range
 from diffdisp.dispersion import Sellmeier
-from diffdisp.film import band_middles
-from diffdisp.fitting import fit, glass_object
+from diffdisp.fitting import COLOR_WAVELENGTHS, FitResult, block_means, fit, glass_object
 from diffdisp.image import Picture, read_picture, replacing, write_picture
-from diffdisp.measuring import REFERENCE, Tradeoff, keep_rows, kept_rows
+from diffdisp.measuring import REFERENCE, Tradeoff, alone, each_once
 from diffdisp.planning import make_plan
+from diffdisp.presets import MOST_FITTED
 from diffdisp.programs import COMPILER_OPTIONS, surroundings
 from diffdisp.rendering import render
 from diffdisp.scene import Scene, object_glass, with_glass
 from diffdisp.scene_file import load_scene, save_scene
+from diffdisp.timing import peak_memory_mb, warm_times
 from diffdisp.tolerance import FALL, correlation, difference, relative, rms
-
-MOST_SAMPLES = 64
-"""Samples per pixel of the best fits that are measured, unless others are asked for."""
 
 MIDDLE = 4
 """Samples per pixel at which, and at four times which, the other knobs are turned."""
@@ -46,9 +41,6 @@ LEAST_BANDS = 3
 
 WARM_FITS, LONG_S = 3, 20.0
 """Fits whose median is told as the time of one; a longer one is not repeated."""
-
-COLOR_WAVELENGTHS = band_middles(400.0, 700.0, 16)
-"""At which indices are compared where the target is in colour, µm."""
 
 
 @dataclass(frozen=True)
@@ -155,7 +147,7 @@ def fit_tradeoff(
     folder: str | os.PathLike[str],
     *,
     object_name: str | None = None,
-    most: int = MOST_SAMPLES,
+    most: int = MOST_FITTED,
     depth: int = 50,
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
@@ -193,21 +185,20 @@ def fit_tradeoff(
         text = saved.read_text(encoding="utf-8")
         asked = [text, object_name, held.hexdigest(), most, depth, seed]
         key = hashlib.sha256(f"{json.dumps(asked)} {surroundings()}".encode()).hexdigest()
-        rows = dict(kept_rows(folder, key, FitSetting, FitMeasured))
-        tell = progress or (lambda done, of: None)
-        tell(len(rows), len(settings))
-        fitted = _Fitting(saved, replace(target, seed=seed), object_name, Path(scratch))
-        best = _reference(fitted, folder / "reference.npz", key, REFERENCE * most, depth)
-        for setting in settings:
-            if setting in rows:
-                continue
-            rows[setting] = _compared(fitted.alone(setting, WARM_FITS), setting, best)
-            keep_rows(folder, key, rows)
-            tell(len(rows), len(settings))
-    measured = tuple(rows[setting] for setting in settings)
+        fitting = _Fitting(saved, replace(target, seed=seed), object_name, Path(scratch))
+
+        def fit_reference() -> _Fitted:
+            return _reference(fitting, folder / "reference.npz", key, REFERENCE * most, depth)
+
+        def measure(setting: FitSetting, best: _Fitted) -> FitMeasured:
+            return _compared(fitting.alone(setting, WARM_FITS), setting, best)
+
+        _, measured = each_once(
+            folder, key, settings, FitMeasured, fit_reference, measure, progress
+        )
     finest = 1 << most.bit_length() - 1  # the most that stand among the settings
     alike = correlation(make_plan(scene, target.film, most, depth, "float64"))
-    apart = rows[FitSetting(finest, depth)].n_d_error
+    apart = measured[settings.index(FitSetting(finest, depth))].n_d_error
     own = apart / difference(finest, REFERENCE * most, alike) * (REFERENCE * most / finest) ** -FALL
     return Tradeoff(settings, measured, own, REFERENCE * most, target.film)
 
@@ -229,8 +220,7 @@ def _shrunk(
 ) -> Float[np.ndarray, "rows columns channels"]:
     """Means of squares of pixels."""
     height, width, channels = values.shape
-    parts = values.reshape(height // shrink, shrink, width // shrink, shrink, channels)
-    return np.asarray(parts.mean(axis=(1, 3)))
+    return block_means(shrink, values).reshape(height // shrink, width // shrink, channels)
 
 
 def _reference(fitting: "_Fitting", path: Path, key: str, samples: int, depth: int) -> _Fitted:
@@ -286,21 +276,10 @@ class _Fitting(NamedTuple):
             "warm": warm,
             "at": np.asarray(at).tolist(),
         }
-        with tempfile.TemporaryDirectory(dir=self.scratch) as empty:  # each compiles anew
-            done = subprocess.run(
-                [sys.executable, "-c", "from diffdisp.fit_measuring import main; main()"],
-                input=json.dumps(asked),
-                env={**os.environ, "JAX_COMPILATION_CACHE_DIR": empty},
-                capture_output=True,
-                text=True,
-                check=False,
-            )
-        if done.returncode == 130:
-            raise KeyboardInterrupt
-        if done.returncode:
-            raise RuntimeError(f"a fit with {setting}: {done.stderr.strip()}")
+        program = "from diffdisp.fit_measuring import main; main()"
+        what = f"a fit with {setting}"
+        told = json.loads(alone(what, ["-c", program], self.scratch, json.dumps(asked)))
         with np.load(output) as stored:
-            told = json.loads(done.stdout)
             return _Fitted(told.pop("n_d"), stored["n"], stored["slope"], told)
 
 
@@ -319,37 +298,34 @@ def _one(asked: dict[str, Any]) -> dict[str, float]:
     scene, target = load_scene(asked["scene"]), read_picture(asked["target"])
     target = replace(target, ceiling=asked["ceiling"])
     name = asked["object"]
-    walls, cpus = [], []
-    for _ in range(1 + asked["warm"]):
-        start, busy = time.perf_counter(), time.process_time()
+
+    def fitted() -> FitResult:
         result = fit(scene, target, object_name=name)
         if result.stopped:  # by Ctrl-C: it is no row
             raise KeyboardInterrupt
-        walls.append(time.perf_counter() - start)
-        cpus.append(time.process_time() - busy)
-        if len(walls) > 1 and walls[-1] > LONG_S:
-            break
-    # Linux counts in KiB, macOS in bytes.
-    unit = 1 if sys.platform == "darwin" else 1024
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
+        return result
+
+    start = time.perf_counter()
+    result = fitted()
+    told = {"n_d": result.n_d}
+    if asked["warm"]:
+        first = time.perf_counter() - start
+        _, wall, cpu = warm_times(fitted, asked["warm"], LONG_S)
+        told |= {
+            "n_d_std": result.n_d_std,
+            "converged": int(result.converged),
+            "compile_s": max(first - wall, 0.0),
+            "fit_s": wall,
+            "cpu_s": cpu,
+            "peak_memory_mb": peak_memory_mb(),
+        }
     slope = np.zeros(0)
     if target.samples is not None:
         slope = _slope(scene, target, glass_object(scene, name))
     with jax.enable_x64(True):
         n = np.asarray(result.glass.indices(np.array(asked["at"])))
     np.savez(asked["output"], n=n, slope=slope)
-    if not asked["warm"]:
-        return {"n_d": result.n_d}
-    wall, cpu = statistics.median(walls[1:]), statistics.median(cpus[1:])
-    return {
-        "n_d": result.n_d,
-        "n_d_std": result.n_d_std,
-        "converged": int(result.converged),
-        "compile_s": max(walls[0] - wall, 0.0),
-        "fit_s": wall,
-        "cpu_s": cpu,
-        "peak_memory_mb": memory,
-    }
+    return told
 
 
 def _slope(

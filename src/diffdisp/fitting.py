@@ -994,7 +994,7 @@ def _level(
 
     What fills no block at the border is left out; where that is all, the blocks are pixels.
     """
-    means = partial(_block_means, size)
+    means = partial(block_means, size)
     share = means(problem.used)
     blocks = np.flatnonzero(_counted(share[:, 0]))
     if not len(blocks):
@@ -1007,7 +1007,7 @@ def _level(
     return Level(name, size, blocks, (part,), target, share, seed, clipped, robust)
 
 
-def _block_means(size: int, values: np.ndarray) -> Float[np.ndarray, "blocks channels"]:
+def block_means(size: int, values: np.ndarray) -> Float[np.ndarray, "blocks channels"]:
     """Means of a picture over all blocks of `size` pixels, without what fills none."""
     height, width = (edge // size for edge in values.shape[:2])
     cut = values[: height * size, : width * size]
@@ -1207,7 +1207,7 @@ def _linearise(
         joined[part.rows] += part.share * traced
     if level.drawing:
         drawn = _drawn(problem, level.drawing, at)
-        joined[:, 0] = _block_means(level.size, drawn)[level.blocks]
+        joined[:, 0] = block_means(level.size, drawn)[level.blocks]
     gains, black = free.exposure(at.others)
     joined *= gains
     radiance, slopes = joined[:, :1], joined[:, 1:]
@@ -2536,7 +2536,7 @@ def _whole_picture(problem: Problem, level: Level, end: Descent, stopped: bool) 
     if len(rest) and not stopped:
         like, (gains, black) = level.parts[0], problem.free.exposure(end.at.others)
         if level.drawing:
-            shown = _block_means(1, _drawn(problem, level.drawing, end.at))[rest]
+            shown = block_means(1, _drawn(problem, level.drawing, end.at))[rest]
         else:
             own = np.arange(len(rest))
             part = _part(problem, 1, like.plan.samples, like.plan.depth, rest, own, like.split)

@@ -21,14 +21,12 @@ from diffdisp.color import VISIBLE
 from diffdisp.film import Film, band_middles
 from diffdisp.image import Picture, linear_rgb, read_picture, replacing
 from diffdisp.planning import make_plan
+from diffdisp.presets import PRESETS
 from diffdisp.programs import surroundings
 from diffdisp.rendering import render
 from diffdisp.scene import Scene
 from diffdisp.scene_file import save_scene
 from diffdisp.tolerance import FALL, correlation, difference, relative, rms
-
-MOST_SAMPLES = 256
-"""Samples per pixel of the best pictures that are measured, unless others are asked for."""
 
 MIDDLE = 16
 """Samples per pixel at which, and at four times which, the other knobs are turned."""
@@ -194,7 +192,7 @@ def tradeoff(
     bands: tuple[float, float, int] | None,
     folder: str | os.PathLike[str],
     *,
-    most: int = MOST_SAMPLES,
+    most: int = PRESETS["reference"].samples,
     depth: int = 50,
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
@@ -228,19 +226,18 @@ def tradeoff(
         save_scene(scene, saved)
         asked = json.dumps([saved.read_text(encoding="utf-8"), size, bands, most, depth, seed])
         key = hashlib.sha256(f"{asked} {surroundings()}".encode()).hexdigest()
-        rows = dict(kept_rows(folder, key, Setting, Measured))
-        tell = progress or (lambda done, of: None)
-        tell(len(rows), len(settings))
-        reference, own_error = _reference(scene, film, folder, key, most, depth, seed)
-        for setting in settings:
-            if setting in rows:
-                continue
-            drawing = _Drawing(saved, size, bands, seed)
+        drawing = _Drawing(saved, size, bands, seed)
+
+        def draw_reference() -> tuple[Picture, float]:
+            return _reference(scene, film, folder, key, most, depth, seed)
+
+        def measure(setting: Setting, best: tuple[Picture, float]) -> Measured:
             picture, timing = _drawn(drawing, setting, Path(scratch))
-            rows[setting] = Measured(*_errors(picture, reference, own_error), **timing)
-            keep_rows(folder, key, rows)
-            tell(len(rows), len(settings))
-    measured = tuple(rows[setting] for setting in settings)
+            return Measured(*_errors(picture, *best), **timing)
+
+        (reference, own_error), measured = each_once(
+            folder, key, settings, Measured, draw_reference, measure, progress
+        )
     assert reference.samples is not None
     return Tradeoff(settings, measured, own_error, reference.samples, film)
 
@@ -256,19 +253,7 @@ def _reference(
     kept = _kept_reference(path, key)
     if kept is not None:
         return kept
-    plan, finest = make_plan(scene, film, most, depth, "float64"), REFERENCE * most
-    counts = (finest if plan.scattering else most, finest)
-    one, other = (
-        render(scene, film, samples=count, depth=depth, seed=seed + number, dtype="float64")
-        for number, count in enumerate(counts, start=1)
-    )
-    apart = rms(np.asarray(one) - other)
-    if plan.scattering:
-        radiance, samples, error = (np.asarray(one) + other) / 2, 2 * finest, apart / 2
-    else:
-        of_first = apart / difference(most, finest, correlation(plan))
-        radiance, samples, error = np.asarray(other), finest, of_first * REFERENCE**-FALL
-    own_error = relative(error, rms(radiance))
+    radiance, samples, own_error = converged(scene, film, most, depth, seed + 1)
     wavelengths = None if film.wavelengths is None else np.asarray(film.wavelengths)
     arrays: dict[str, Any] = {"radiance": radiance, "samples": samples}
     arrays |= {"error": own_error, "key": key}
@@ -277,6 +262,36 @@ def _reference(
     with replacing(path) as beside, beside.open("wb") as file:
         np.savez(file, **arrays)
     return Picture(radiance, wavelengths, samples), own_error
+
+
+def converged(
+    scene: Scene, film: Film, most: int, depth: int, seed: int
+) -> tuple[Float[np.ndarray, "height width channels"], int, float]:
+    """A picture by which others of at most so many samples are measured.
+
+    Args:
+        scene: as in `tradeoff`.
+        film: of the picture.
+        most: samples per pixel of the others.
+        depth: segments of its paths.
+        seed: of the first of the two pictures that it takes, the other has the next.
+
+    Returns:
+        The radiance; its samples per pixel; the root mean square of its error over its own.
+    """
+    plan, finest = make_plan(scene, film, most, depth, "float64"), REFERENCE * most
+    counts = (finest if plan.scattering else most, finest)
+    one, other = (
+        np.asarray(render(scene, film, samples=n, depth=depth, seed=seed + k, dtype="float64"))
+        for k, n in enumerate(counts)
+    )
+    apart = rms(one - other)
+    if plan.scattering:
+        radiance, samples, error = (one + other) / 2, 2 * finest, apart / 2
+    else:
+        of_first = apart / difference(most, finest, correlation(plan))
+        radiance, samples, error = other, finest, of_first * REFERENCE**-FALL
+    return radiance, samples, relative(error, rms(radiance))
 
 
 def _kept_reference(path: Path, key: str) -> tuple[Picture, float] | None:
@@ -318,19 +333,8 @@ def _drawn(drawing: _Drawing, setting: Setting, scratch: Path) -> tuple[Picture,
         words += ["--bands", ":".join(map(str, bands))]
     if setting.dtype == "float64":
         words.append("--float64")
-    with tempfile.TemporaryDirectory(dir=scratch) as empty:  # what is kept there is compiled anew
-        done = subprocess.run(
-            [sys.executable, "-m", "diffdisp", *map(str, words)],
-            env={**os.environ, "JAX_COMPILATION_CACHE_DIR": empty},
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-    if done.returncode == 130:
-        raise KeyboardInterrupt
-    if done.returncode:
-        raise RuntimeError(f"diffdisp {' '.join(map(str, words))}: {done.stderr.strip()}")
-    told = json.loads(done.stdout)
+    command = ["diffdisp", *map(str, words)]
+    told = json.loads(alone(" ".join(command), ["-m", *command], scratch))
     picture = read_picture(output)
     if setting.bands:
         picture = Picture(linear_rgb(picture))
@@ -340,17 +344,60 @@ def _drawn(drawing: _Drawing, setting: Setting, scratch: Path) -> tuple[Picture,
     return whole, {name: told[name] for name in names}
 
 
+def alone(what: str, words: Sequence[str], scratch: Path, given: str = "") -> str:
+    """What a Python process prints that compiles all it runs anew.
+
+    Args:
+        what: it does, for the message where it fails.
+        words: its arguments.
+        scratch: a folder.
+        given: its standard input.
+
+    Raises:
+        RuntimeError: it failed.
+        KeyboardInterrupt: it was interrupted.
+    """
+    with tempfile.TemporaryDirectory(dir=scratch) as empty:  # there is nothing kept here
+        done = subprocess.run(
+            [sys.executable, *words],
+            input=given,
+            env={**os.environ, "JAX_COMPILATION_CACHE_DIR": empty},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+    if done.returncode == 130:
+        raise KeyboardInterrupt
+    if done.returncode:
+        raise RuntimeError(f"{what}: {done.stderr.strip()}")
+    return done.stdout
+
+
 def _errors(picture: Picture, reference: Picture, own_error: float) -> tuple[float, float, float]:
     """The errors of a picture, as in `Measured`."""
-    size = rms(reference.radiance)
-    apart = rms(picture.radiance - reference.radiance)
-    error = relative(math.sqrt(max(apart**2 - (own_error * size) ** 2, 0.0)), size)
+    error = error_beyond(picture.radiance, reference.radiance, own_error)
     try:
         seen, true = linear_rgb(picture), linear_rgb(reference)
     except ValueError:
         return error, float("nan"), float("nan")
     difference = delta_e(seen, true)
     return error, float(difference.mean()), float(np.percentile(difference, 99))
+
+
+def error_beyond(
+    radiance: Float[np.ndarray, "height width channels"],
+    reference: Float[np.ndarray, "height width channels"],
+    own_error: float,
+) -> float:
+    """Root mean square of a picture's error over that of the reference, less the reference's own.
+
+    Args:
+        radiance: of the picture.
+        reference: a better one.
+        own_error: of that, over its root mean square.
+    """
+    size, apart = rms(reference), rms(radiance - reference)
+    return relative(math.sqrt(max(apart**2 - (own_error * size) ** 2, 0.0)), size)
 
 
 def delta_e(
@@ -383,14 +430,43 @@ def delta_e(
 # Rows that are kept.
 
 
-def keep_rows(folder: Path, key: str, rows: Mapping[Any, Any]) -> None:
-    """Write tradeoff.csv, whole or not at all.
+def each_once(
+    folder: Path,
+    key: str,
+    settings: Sequence[Any],
+    kind: Any,
+    find_reference: Callable[[], Any],
+    measure: Callable[[Any, Any], Any],
+    progress: Callable[[int, int], None] | None,
+) -> tuple[Any, tuple[Any, ...]]:
+    """What is measured of each setting, unless the folder's tradeoff.csv holds it already.
 
     Args:
-        folder: where to.
-        key: of what is measured; it stands in each row.
-        rows: what was measured, one dataclass for each setting, which is one too.
+        folder: where that file is kept.
+        key: of all that the rows depend on beside the setting; it stands in each.
+        settings: dataclasses of numbers and words, all of one kind.
+        kind: the dataclass of what is measured.
+        find_reference: gives what each is compared with.
+        measure: gives the row of a setting, beside the reference.
+        progress: as in `tradeoff`.
+
+    Returns:
+        The reference; the row of each setting.
     """
+    rows = dict(_kept_rows(folder, key, type(settings[0]), kind))
+    tell = progress or (lambda done, of: None)
+    tell(len(rows), len(settings))
+    reference = find_reference()
+    for setting in settings:
+        if setting not in rows:
+            rows[setting] = measure(setting, reference)
+            _keep_rows(folder, key, rows)
+            tell(len(rows), len(settings))
+    return reference, tuple(rows[setting] for setting in settings)
+
+
+def _keep_rows(folder: Path, key: str, rows: Mapping[Any, Any]) -> None:
+    """Write tradeoff.csv, whole or not at all."""
     lines = [{**asdict(setting), **asdict(row), "key": key} for setting, row in rows.items()]
     with (
         replacing(folder / "tradeoff.csv") as beside,
@@ -401,15 +477,8 @@ def keep_rows(folder: Path, key: str, rows: Mapping[Any, Any]) -> None:
         writer.writerows(lines)
 
 
-def kept_rows(folder: Path, key: str, setting: Any, measured: Any) -> Iterator[tuple[Any, Any]]:
-    """What tradeoff.csv holds that was measured for the same.
-
-    Args:
-        folder: where it is looked for.
-        key: as in `keep_rows`.
-        setting: the dataclass of settings, of numbers and words.
-        measured: that of what was measured.
-    """
+def _kept_rows(folder: Path, key: str, setting: Any, measured: Any) -> Iterator[tuple[Any, Any]]:
+    """What tradeoff.csv holds that was measured for the same."""
     try:
         with (folder / "tradeoff.csv").open(encoding="utf-8", newline="") as file:
             kept = [row for row in csv.DictReader(file) if row.get("key") == key]

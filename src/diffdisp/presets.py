@@ -33,3 +33,6 @@ PRESETS = {
     "standard": Preset(16, 0.0035, (0.028, 0.055)),
     "reference": Preset(256, 0.00069, (0.0047, 0.0096)),
 }
+
+MOST_FITTED = 64
+"""Samples per pixel up to which fits are measured, unless others are asked for."""
